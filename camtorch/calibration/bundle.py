@@ -135,17 +135,6 @@ class Adjusted:
     def equations(self) -> Equations:
         return self.problem.equations(self.problem.flat(self.state))
 
-    @cached_property
-    @torch.no_grad()
-    def held_by(self) -> int:
-        """Number of points that another step would lose, which stop a search that did not converge."""
-        problem, flat = self.problem, self.problem.flat(self.state)
-        rows = torch.arange(len(self.cost), device=self.cost.device)
-        before = problem.all_errors(flat, rows)
-        step, _ = problem.linearised(flat, rows).step(torch.full_like(self.cost, FIRST_DAMPING))
-        after = problem.all_errors(problem.moved(flat, step, rows), rows)
-        return sum(int((a.valid & ~b.valid & (a.weights > 0)).sum()) for a, b in zip(before, after, strict=True))
-
 
 @torch.no_grad()
 def adjust(

@@ -33,7 +33,6 @@ _SMOOTH = 0.02  # the weight of a surface's second differences, in px, see `Came
 _BESIDE = 1e-3  # radians from the axis: the second point that holds a surface's frame
 _SECOND_LOOKS = 3  # the most searches for better poses
 _AS_GOOD = 9.0  # variances: optima whose costs differ by less are equally good
-_APART, _SAME = 5.0, 1e-3  # standard deviations, and part of the parameter, by which two optima differ
 
 
 @dataclass(frozen=True)
@@ -173,9 +172,7 @@ def calibrate(
     search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
     (result,) = results([search], search.alone(bend, on_progress), search.free(bend)).cameras
     if not result.converged:
-        ends = [] if bool(result.adjusted.converged[0]) else ["the search did not end at an optimum"]
-        ends += [f"{lost} corners have no pixel: a surface must reach further"] if (lost := result.lost) else []
-        warn(f"{owner}: {', and '.join(ends)} (rms {result.rms:.4g} px). Do not use the result; see its warnings")
+        warn(f"{owner}: {result.failure} (rms {result.rms:.4g} px). Do not use the result; see its warnings")
     return result
 
 
@@ -263,50 +260,30 @@ class Search:
     def adjusted(self, observed: Sequence[CameraObservations], state: State, free: Free, **options: Any) -> Adjusted:
         return adjust(observed, state, free, loss=self.loss, loss_scale=self.loss_scale, **options)
 
-    def other_optima(
+    def in_best_basin(
         self, camera: int, observed: Sequence[CameraObservations], adjusted: Adjusted, free: Free
-    ) -> tuple[Adjusted, Optima | None]:
-        """Return the best optimum of this model's basins, and all of them (None if it has one basin)."""
+    ) -> Adjusted:
+        """Return the best optimum of this model's basins, if it has several."""
         state = adjusted.state
         boards = _seen_from(state, camera)
         learns, size = free.parameters[camera].cpu(), self.layout.image_size
         starts = other_cameras(state.parameters[camera], learns, boards, self.seen, self.asked.kind, size)
         if starts is None:
-            return adjusted, None
+            return adjusted
         first = state.of(torch.zeros(len(starts), dtype=torch.long, device=starts.device))
         parameters = tuple(starts if c == camera else p for c, p in enumerate(first.parameters))
         others = self.adjusted(observed, first._replace(parameters=parameters), free)
-        ends = [(found.state.parameters[camera], found.cost, found.converged) for found in (others, adjusted)]
         best = others.cost.argmin()[None]
         variance = adjusted.cost / (2 * sum(int((one.weights > 0).sum()) for one in observed))
-        if bool(others.cost[best] < adjusted.cost - _AS_GOOD * variance):  # an equal one does not replace the first
-            adjusted = self.adjusted(observed, others.state.of(best), free, steps=STEPS)
-        return adjusted, Optima(*map(torch.cat, zip(*ends, strict=True)))
+        if not bool(others.cost[best] < adjusted.cost - _AS_GOOD * variance):  # an equal one does not replace the first
+            return adjusted
+        return self.adjusted(observed, others.state.of(best), free, steps=STEPS)
 
 
 def _seen_from(state: State, camera: int) -> Poses:
     """Return the boards' poses in the frame of one camera."""
     rotations, translations = (t[:, camera, None] for t in state.mounts)
     return Poses(rotations @ state.boards.rotations, state.boards.translations @ rotations[:, 0].mT + translations)
-
-
-class Optima(NamedTuple):
-    """The ends of S searches: parameters (S, 4 + n) of one camera, costs and whether they converged, (S,)."""
-
-    parameters: Tensor
-    cost: Tensor
-    converged: Tensor
-
-    def twins(self, found: Calibration) -> tuple[tuple[float, ...], ...]:
-        """Return parameters of other optima that are as good as the one found, up to the noise."""
-        if not found.converged:
-            return ()
-        as_good = self.converged & (self.cost - found.adjusted.cost[0] <= _AS_GOOD * found.sigma**2)
-        twins = [found.spread.parameters[0]]
-        for new in self.parameters[as_good][self.cost[as_good].argsort()]:
-            if all(bool(((new - p).abs() > _APART * found.std + _SAME * p.abs().clamp(min=1)).any()) for p in twins):
-                twins.append(new)
-        return tuple(tuple(p.tolist()) for p in twins[1:])
 
 
 class Results(NamedTuple):
@@ -321,10 +298,9 @@ class Results(NamedTuple):
 
 def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Results:
     """Return the results of an optimum, or of a better one in another basin of a model."""
-    observed, optima = [search.observed for search in searches], []
+    observed = [search.observed for search in searches]
     for c, search in enumerate(searches):
-        adjusted, found = search.other_optima(c, observed, adjusted, free)
-        optima.append(found)
+        adjusted = search.in_best_basin(c, observed, adjusted, free)
     spreads = [spread(adjusted, search.asked.kind, c) for c, search in enumerate(searches)]
     for c, search in enumerate(searches):
         check_determined(adjusted, c, spreads[c], search.asked.names, observed[c], search.owner)
@@ -355,14 +331,13 @@ def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Resul
             bend=(float(state.bend[0, 0]), float(state.bend[0, 1])),
             image_size=layout.image_size,
             views=tuple(layout.views.tolist()),
-            copies=tuple(sorted({*layout.copies, *copies})),
+            copies=tuple(copies),
             observations=one,
             adjusted=adjusted,
             point_inliers=own,
             loss=search.loss,
             index=c,
         )
-        camera.twins = () if (ends := optima[c]) is None else ends.twins(camera)
         cameras.append(camera)
     return Results(adjusted, cameras, rms_of(residuals, seen), float(sigma), noise)
 

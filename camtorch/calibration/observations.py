@@ -8,26 +8,19 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
-from camtorch.values.arguments import Numbers, as_image_size, as_values, shown, warn
+from camtorch.values.arguments import Numbers, as_known_size, as_values, shown, warn
 
 Points: TypeAlias = Numbers | Sequence[Numbers | None]
 """Points of all views: a tensor, an array, or a list with one of them, or None, for each view."""
-Array: TypeAlias = NDArray[Any]
 
 _LEAST_CORNERS = 4
 _FLAT = 1e-5  # the width of a set of points over its length, below which it is a line
-_ROUNDING = 1e-11  # of coordinates: rounding of points far from the board's origin
-_LEAST_UNIT, _MOST_UNIT = 1e-30, 1e30
 _NORMALISED = 3.0  # px: coordinates that all are smaller are normalised ones
 _RIM = 0.02  # of the longer side: no detector finds corners further outside the image
-_MANY_OUTSIDE = 0.2  # of all corners, more than a robust loss can bear
-_FEW_OUTSIDE, _FEW_LEFT = 0.02, 0.2  # of all corners outside, and of these with the image's sides exchanged
-_MOST_OF_A_VIEW = 0.5
-_NOWHERE = 10.0  # times the longer side: not even an outlier is so far outside
-_SAME_PIXEL = 3  # corners of a view at one pixel
+_MANY_OUTSIDE, _MOST_OF_A_VIEW = 0.05, 0.5  # of all corners, more than outliers; of those of a view
 _SAME_ERRORS = 0.1  # the squared distance of two views over their squared residuals, which is 1 for independent noise
 _SAME_NOISE = 0.1  # px, the distance of two views that saving a file again may cause
 _NAMED = 6  # views at most, in a message
@@ -52,7 +45,6 @@ class Layout(NamedTuple):
     views: Tensor  # (V,) the indices of passed views that have corners
     seen: Tensor  # (V, N) of the observations
     image_size: tuple[int, int]  # (height, width)
-    copies: tuple[int, ...]  # the indices of passed views without new evidence: see `_observed` and `repeats`
 
     def restore(self, values: Tensor) -> Any:
         """Return results (V, N, k) or (V, N) in the form of the image points, NaN (of bool: False) if unseen."""
@@ -68,9 +60,7 @@ def as_observations(
     object_points: Points, image_points: Points, image_size: Sequence[int], owner: str
 ) -> tuple[Observations, Layout]:
     """Return the observations of one camera, of views that have corners, and the form for its results."""
-    if isinstance(image_points, Mapping):
-        raise TypeError(f"{owner}: image_points must be a tensor or a list; got a mapping. Use calibrate_rig for it")
-    return _observed(object_points, {"": image_points}, {"": image_size}, owner)[""]
+    return as_rig_observations(object_points, {"": image_points}, {"": image_size}, {"": None}, owner)[""]
 
 
 def as_rig_observations(
@@ -82,15 +72,57 @@ def as_rig_observations(
 ) -> dict[str, tuple[Observations, Layout]]:
     """Return the observations of a rig's cameras of the same boards, by name in the order of the models."""
     for argument, given in {"models": models, "image_points": image_points, "image_sizes": image_sizes}.items():
-        if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
-            got = f"{type(given).__name__} {shown(given)}"
-            raise TypeError(f"{owner}: {argument} must be a mapping by names of cameras; got {got}")
-        if not given or set(given) != set(models):
-            raise ValueError(
-                f"{owner}: models, image_points and image_sizes must name the same cameras; got {argument} of "
-                f"{list(given)} and models of {list(models)}"
-            )
-    return _observed(object_points, {name: image_points[name] for name in models}, image_sizes, owner)
+        is_mapping = isinstance(given, Mapping)
+        if not is_mapping or not given or set(given) != set(models):
+            got = f"{argument} of {list(given) if is_mapping else type(given).__name__}"
+            words = "models, image_points and image_sizes must be mappings by the same names of cameras"
+            raise (ValueError if is_mapping else TypeError)(f"{owner}: {words}; got {got}")
+    owners = {name: f"{owner}: {name}" if name else owner for name in models}
+    given = {name: _as_views(image_points[name], 2, "image_points", of) for name, of in owners.items()}
+    boards, *_ = _as_views(object_points, 3, "object_points", owner)
+    counts = {name or "image_points": len(views) for name, (views, *_) in given.items()}
+    counts |= {"object_points": len(boards)} if len(boards) > 1 else {}
+    if len(set(counts.values())) > 1:
+        raise ValueError(f"{owner}: all arguments must have the same views; got numbers of views {counts}")
+    device = next(iter(given.values()))[0][0].device
+    boards = [board.to(device) for board in boards]
+    boards = boards * next(iter(counts.values())) if len(boards) == 1 else boards
+    points = pad_sequence(boards, batch_first=True, padding_value=torch.nan)
+    found: dict[str, tuple[Observations, Layout]] = {}
+    for name, (views, shapes, stacked) in given.items():
+        size = as_known_size(image_sizes[name], owners[name])
+        pixels = torch.full_like(points[..., :2], torch.nan)
+        for i, (view, board) in enumerate(zip(views, boards, strict=True)):
+            if len(view) not in (0, len(board)):
+                raise ValueError(
+                    f"{owners[name]}: view {i}: image_points must be as many corners as object_points, {len(board)} "
+                    f"(inner ones of a chessboard); got {len(view)}. Pass rows of NaN for corners that were not found"
+                )
+            pixels[i, : len(view)] = view
+        seen = ~pixels.isnan().any(-1)
+        _check_corners(points, pixels, seen, owners[name])
+        _check_inside(pixels, seen, size, owners[name])
+        forms = tuple((len(b),) if shape is None else shape for b, shape in zip(boards, shapes, strict=True))
+        found[name] = Observations(points, pixels, seen), Layout(forms, stacked, seen, seen, size)
+    sees = torch.stack([observations.seen.any(-1) for observations, _ in found.values()])
+    # cameras must share a view, at least by way of others, with the first
+    names, linked = list(found), torch.arange(len(sees), device=device) == 0
+    for _ in names:
+        linked = linked | (sees & sees[linked].any(0)).any(-1)
+    if not bool(linked.all()):
+        apart = ", ".join(repr(names[i]) for i in (~linked).nonzero()[:, 0].tolist())
+        raise ValueError(
+            f"{owner}: cameras must share views with {names[0]!r}, directly or through others; got no such view of "
+            f"{apart}. Take views that both see, or calibrate it alone"
+        )
+    if not bool(sees.any(0).all()):
+        warn(f"{owner}: {_views_of(~sees.any(0))} left out, because nothing was seen")
+    (kept,) = sees.any(0).nonzero(as_tuple=True)
+    for name, (observations, layout) in found.items():
+        pixels = torch.where(observations.seen[..., None], observations.pixels, 0.0)
+        whole = Observations(points.nan_to_num(), pixels, observations.seen).of(kept)
+        found[name] = whole, layout._replace(views=kept, seen=whole.seen)
+    return found
 
 
 def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Tensor:
@@ -112,185 +144,88 @@ def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Ten
     return order[first[group] != order].sort().values
 
 
-def _observed(
-    object_points: Points, image_points: Mapping[str, Points], image_sizes: Mapping[str, Any], owner: str
-) -> dict[str, tuple[Observations, Layout]]:
-    """Return the observations of cameras by name, "" for a single one, without views that have no corners."""
-    labels = {name: f"image_points[{name!r}]" if name else "image_points" for name in image_points}
-    given = {name: _in_views(image_points[name], 2, label, owner) for name, label in labels.items()}
-    boards, *_ = _in_views(object_points, 3, "object_points", owner)
-    numbers = {label: len(given[name][0]) for name, label in labels.items()}
-    numbers |= {"object_points": len(boards)} if len(boards) > 1 or boards[0] is None else {}
-    if len(set(numbers.values())) > 1:
-        raise ValueError(f"{owner}: all arguments must have the same views; got numbers of views {numbers}")
-    boards = boards * len(next(iter(given.values()))[0]) if len(boards) == 1 else boards
-    lengths = [0 if board is None else len(board) for board in boards]
-    points, sizes, pixels = _pad(boards, max(lengths), 3), {}, {}
-    seen: dict[str, Array] = {}
-    for name, (views, *_) in given.items():
-        size_label = f"image_sizes[{name!r}]" if name else "image_size"
-        if (size := as_image_size(image_sizes[name], owner, size_label)) is None:
-            raise ValueError(f"{owner}: {size_label} must be given; got None. Pass (height, width), image.shape[:2]")
-        for i, (view, length) in enumerate(zip(views, lengths, strict=True)):
-            if view is not None and len(view) not in (0, length):
-                raise ValueError(
-                    f"{owner}: view {i}: {labels[name]}[{i}] must be as many corners as object_points, {length} (inner "
-                    f"ones of a chessboard); got {len(view)}. Pass rows of NaN for corners that were not found"
-                )
-        of = _pad(views, max(lengths), 2)
-        seen[name] = ~np.isnan(of.sum(-1))
-        sizes[name], pixels[name] = size, np.where(seen[name][..., None], of, np.nan)
-        _check_corners(points, pixels[name], seen[name], labels[name], owner)
-        _check_inside(pixels[name], seen[name], labels[name], size, size_label, owner)
-    sees: Array = np.stack([of.any(-1) for of in seen.values()])
-    # cameras must share a view, at least by way of others, with the first
-    names, linked = list(given), np.arange(len(given)) == 0
-    for _ in names:
-        linked = linked | (sees & sees[linked].any(0)).any(-1)
-    if not linked.all():
-        apart = ", ".join(repr(name) for name, is_linked in zip(names, linked, strict=True) if not is_linked)
-        raise ValueError(
-            f"{owner}: cameras must share views with {names[0]!r}, directly or through others; got no such view of "
-            f"{apart}. Take views that both see, or calibrate it alone"
-        )
-    first: dict[bytes, int] = {}
-    has: Array = np.any(sees, 0)
-    rows = enumerate(np.concatenate([_sort_rows(of) for of in pixels.values()], 1) + 0.0)
-    copy: Array = has & np.array([first.setdefault(row.tobytes(), i) != i for i, row in rows])
-    for left_out, why in ((~has, "nothing was seen"), (copy, "the corners are those of another view")):
-        if left_out.any():
-            warn(f"{owner}: {_views_of(left_out)} left out, because {why}")
-    every = [v for value in image_points.values() for v in (value if isinstance(value, (list, tuple)) else [value])]
-    device = next((view.device for view in every if isinstance(view, Tensor)), torch.device("cpu"))
-    kept, found = np.flatnonzero(has & ~copy), {}
-    for name, (_, shapes, stacked) in given.items():
-        arrays = np.nan_to_num(points[kept]), np.nan_to_num(pixels[name][kept]), seen[name][kept], kept
-        *corners, numbered = (torch.as_tensor(array, device=device) for array in arrays)
-        forms = tuple((n,) if shape is None else shape for n, shape in zip(lengths, shapes, strict=True))
-        copies = tuple(np.flatnonzero(copy & seen[name].any(-1)).tolist())
-        found[name] = Observations(*corners), Layout(forms, stacked, numbered, corners[2], sizes[name], copies)
-    return found
-
-
-def _in_views(
+def _as_views(
     value: Points, size: int, name: str, owner: str
-) -> tuple[list[Array | None], list[tuple[int, ...] | None], bool]:
+) -> tuple[list[Tensor], list[tuple[int, ...] | None], bool]:
     """Return points (n, size) of each view, their shapes (None for no points), and whether they were one array."""
-    parts: list[Array | None] = []
-    if isinstance(value, (list, tuple)):
-        parts = [None if p is None else _as_array(p, size, f"{name}[{i}]", owner) for i, p in enumerate(value)]
-    are_rows = bool(parts) and all(p is not None and p.ndim == 1 <= p.size for p in parts)  # of plain numbers
-    stacked, is_one = are_rows or not isinstance(value, (list, tuple)), False
+    listed = list(value) if isinstance(value, (list, tuple)) else []
+    first = next((part for part in listed if part is not None and len(part)), None)
+    are_rows = first is not None and not hasattr(first[0], "__len__")  # of plain numbers
+    stacked = are_rows or not isinstance(value, (list, tuple))
     if stacked:
-        whole = _as_array(value, size, name, owner)
-        # (N, 1, size) is OpenCV's form of one set of points
-        is_one = whole.ndim < 3 or (whole.ndim == 3 and whole.shape[1] == 1 < whole.shape[0])
-        parts = [whole] if is_one else list(whole)
-    if all(part is None for part in parts):
+        whole = _as_double(value, name, owner)
+        # (N, 1, 3) is OpenCV's form of one board
+        is_one = size == 3 and (whole.ndim < 3 or (whole.ndim == 3 and whole.shape[1] == 1 < whole.shape[0]))
+        listed = [whole] if is_one else [*whole]
+    if all(part is None for part in listed):
         raise ValueError(f"{owner}: {name} must have a view with points; got {shown(value)}")
-    rows: list[Array | None] = []
-    for i, part in enumerate(parts):
-        flat = part if part is None or part.size else np.empty((0, size))
-        if flat is not None and flat.ndim == 3 and 1 in flat.shape[:2]:
-            flat = flat.reshape(-1, flat.shape[-1])
-        if flat is not None and (flat.ndim != 2 or flat.shape[1] != size or (is_one and size == 2)):
-            form = f"(V, N, {size}) or a list of (N_i, {size})" if stacked and size == 2 else f"(N, {size})"
-            shape = whole.shape if stacked or part is None else part.shape
-            raise ValueError(f"{owner}: {name}{'' if stacked else f'[{i}]'} must be {form}; got shape {shape}")
-        rows.append(flat)
-    return rows, [None if p is None else p.shape[:-1] or (0,) for p in parts], stacked
+    views, shapes = [], []
+    for i, part in enumerate(listed):
+        one = torch.empty(0, size, dtype=torch.float64, device="cpu") if part is None else part
+        one = one if stacked else _as_double(one, f"{name}[{i}]", owner)
+        shapes.append(None if part is None else tuple(one.shape[:-1]) or (0,))
+        if one.numel() and (one.shape[-1] != size or one.ndim != 2 + (one.ndim == 3 and 1 in one.shape[:2])):
+            forms = f"(V, N, {size}) or a list of (N_i, {size})" + ", or (N, 3) for all views" * (size == 3)
+            got = tuple(whole.shape) if stacked else f"{tuple(one.shape)} in view {i}"
+            raise ValueError(f"{owner}: {name} must be {forms}; got shape {got}")
+        views.append(one.reshape(-1, size))
+    device = next((view.device for view in views if view.numel()), views[0].device)
+    return [view.to(device) for view in views], shapes, stacked
 
 
-def _as_array(value: Any, size: int, name: str, owner: str) -> Array:
-    """Return a float64 array; None among the numbers of a list becomes NaN."""
+def _as_double(value: Any, name: str, owner: str) -> Tensor:
+    """Return a float64 tensor; None among the numbers of a list becomes NaN."""
     if isinstance(value, (list, tuple)):
         try:
-            plain = [v.numpy(force=True) if isinstance(v, Tensor) else v for v in value]
-            value = np.asarray([[math.nan] * size if v is None else v for v in plain], np.float64)
+            value = np.asarray(value, np.float64)
         except (TypeError, ValueError) as error:
-            raise type(error)(f"{owner}: {name} must be rows of {size} numbers; got {shown(value)}: {error}") from None
-    values = as_values(value, name, owner, value.device if isinstance(value, Tensor) else torch.device("cpu"))
-    if values.is_meta:
-        raise ValueError(f"{owner}: {name} must have values; got a tensor on the device meta")
-    return values.detach().double().numpy(force=True)
+            raise type(error)(f"{owner}: {name} must be rows of numbers; got {shown(value)}: {error}") from None
+    device = value.device if isinstance(value, Tensor) else torch.device("cpu")
+    return as_values(value, name, owner, device).detach().double()
 
 
-def _pad(views: Sequence[Array | None], count: int, size: int) -> Array:
-    """Pad the points of views to (V, count, size) with NaN."""
-    padded = np.full((len(views), count, size), np.nan)
-    for row, points in zip(padded, views, strict=True):
-        if points is not None:
-            row[: len(points)] = points
-    return padded
-
-
-def _sort_rows(rows: Array) -> Array:
-    """Sort the rows (V, N, k) of each view, NaN last."""
-    return np.take_along_axis(rows, np.lexsort(np.moveaxis(rows, -1, 0))[..., None], 1)
-
-
-def _has_repeats(rows: Array, times: int) -> Array:
-    """Whether so many rows (V, N, k) of a view are equal, (V,); NaN equals nothing."""
-    ordered = _sort_rows(rows)
-    same: Array = (ordered[:, times - 1 :] == ordered[:, : rows.shape[1] - times + 1]).all(-1).any(-1)
-    return same
-
-
-def _check_corners(points: Array, pixels: Array, seen: Array, name: str, owner: str) -> None:
+def _check_corners(points: Tensor, pixels: Tensor, seen: Tensor, owner: str) -> None:
     """Raise if corners determine no pose; points (V, N, 3) and pixels (V, N, 2) are NaN if padded."""
-    number, corners = seen.sum(-1), np.where(seen[..., None], points, np.nan)
-    if not number.any():
-        raise ValueError(f"{owner}: {name} must have seen corners; got NaN in all views")
-    known = np.nan_to_num(corners, posinf=0.0, neginf=0.0)
-    reach = np.abs(known).max((1, 2))
-    known = known / np.where(reach > 0, reach, 1.0)[:, None, None]
-    offsets = (known - known.sum(1, keepdims=True) / np.maximum(number, 1)[:, None, None]) * seen[..., None]
-    spread = np.sqrt(np.linalg.eigvalsh(offsets.swapaxes(1, 2) @ offsets).clip(min=0))  # (V, 3) ascending
-    thin = spread[:, 1] <= np.maximum(_FLAT * spread[:, 2], _ROUNDING)
-    odd, at_one = (reach > 0) & ((reach <= _LEAST_UNIT) | (reach >= _MOST_UNIT)), _has_repeats(pixels, _SAME_PIXEL)
+    number = seen.sum(-1)
+    if not bool(number.any()):
+        raise ValueError(f"{owner}: image_points must have seen corners; got NaN in all views")
+    corners = torch.where(seen[..., None], points, 0.0).nan_to_num(0.0, 0.0, 0.0)
+    offsets = (corners - (corners.sum(1) / number.clamp(min=1)[:, None])[:, None]) * seen[..., None]
+    spread = torch.linalg.svdvals(offsets)  # (V, 3) descending
+    finite = torch.isfinite(points).all(-1) & torch.isfinite(pixels).all(-1)
     for wrong, words in (
-        (np.isinf(pixels).any((1, 2)), f"{name} must not be infinite; unseen corners are NaN"),
-        (number < _LEAST_CORNERS, f"{name} must have {_LEAST_CORNERS} or more seen corners; or leave it out"),
-        ((~np.isfinite(corners).all(-1) & seen).any(-1), "object_points must be finite where image_points are"),
-        (odd, f"object_points must be in a unit near the board's size; got up to {reach.max():.3g}"),
-        (thin, "object_points of the seen corners must not lie on one line, or be the same point"),
-        (_has_repeats(corners, 2), "object_points must have each corner once; got one twice"),
-        (at_one, f"{name} must not have {_SAME_PIXEL} corners at one pixel; corners that were not found are NaN"),
+        (number < _LEAST_CORNERS, f"image_points must have {_LEAST_CORNERS} or more seen corners; or leave it out"),
+        ((seen & ~finite).any(-1), "object_points and image_points must be finite; unseen corners are NaN"),
+        (
+            spread[:, 1] <= _FLAT * spread[:, 0],
+            "object_points of the seen corners must not lie on one line, or be one point",
+        ),
+        ((pixels == 0).all(-1).sum(-1) > 1, "image_points must be NaN for corners that were not found; got (0, 0)"),
     ):
-        if (wrong & (number > 0)).any():
+        if bool((wrong & (number > 0)).any()):
             raise ValueError(f"{owner}: {_views_of(wrong & (number > 0))}: {words}")
 
 
-def _check_inside(pixels: Array, seen: Array, name: str, size: tuple[int, int], size_name: str, owner: str) -> None:
+def _check_inside(pixels: Tensor, seen: Tensor, size: tuple[int, int], owner: str) -> None:
     """Raise if pixels do not lie in an image of this size."""
     found = pixels[seen]
-    low, high = ("({:.6g}, {:.6g})".format(*end) for end in (found.min(0), found.max(0)))
-    if np.abs(found).max() < _NORMALISED < min(size) / 2:
+    over = torch.maximum(pixels - pixels.new_tensor(size[::-1]) + 1.0, -pixels)
+    out = (over > _RIM * max(size)).any(-1)  # False for NaN
+    bad = out.sum(-1) > _MOST_OF_A_VIEW * seen.sum(-1)
+    bad |= float(found.abs().max()) < _NORMALISED < min(size) / 2
+    if bool(bad.any()) or int(out.sum()) > _MANY_OUTSIDE * len(found):
+        low, high = ("({:.6g}, {:.6g})".format(*end.tolist()) for end in (found.amin(0), found.amax(0)))
         raise ValueError(
-            f"{owner}: {name} must be pixels, not normalised coordinates; got {low} to {high} in an image of "
-            f"{size[0]} x {size[1]}"
-        )
-
-    def outside(sides: tuple[int, int], rim: float) -> Array:
-        over = np.maximum(pixels - np.array(sides[::-1]) + 1.0, -pixels)
-        far: Array = (over > rim * max(size)).any(-1)  # False for NaN
-        return far
-
-    out = outside(size, _RIM)
-    number, total = int(out.sum()), len(found)
-    exchanged = number > _FEW_OUTSIDE * total and int(outside(size[::-1], _RIM).sum()) <= _FEW_LEFT * number
-    views: Array = (out.sum(-1) > _MOST_OF_A_VIEW * seen.sum(-1)) | outside(size, _NOWHERE).any(-1)
-    if exchanged or number > _MANY_OUTSIDE * total or views.any():
-        raise ValueError(
-            f"{owner}: {name} must lie in the image of {size_name} {size}; got {number} of {total} corners outside, in "
-            f"{_views_of(views if views.any() else out.sum(-1))}, from {low} to {high}. {size_name} is "
-            "(height, width) of all images, as image.shape[:2], points are (u, v), and unseen corners NaN"
+            f"{owner}: image_points must be pixels in the image of image_size {size}; got {int(out.sum())} of "
+            f"{len(found)} corners outside, and values from {low} to {high}, in "
+            f"{_views_of(bad if bool(bad.any()) else out.any(-1))}. image_size is (height, width) of all images, as "
+            "image.shape[:2], points are (u, v), and unseen ones NaN"
         )
 
 
-def _views_of(views: Array) -> str:
+def _views_of(views: Tensor) -> str:
     """Return the views of a mask (V,) in words."""
-    return named(np.flatnonzero(views).tolist())
+    return named(views.nonzero()[:, 0].tolist())
 
 
 def named(views: Sequence[int]) -> str:

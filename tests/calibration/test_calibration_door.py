@@ -39,8 +39,7 @@ REPEATED = np.repeat(BOARD[None], len(VIEWS), 0)
 @pytest.mark.parametrize(
     "object_points",
     [
-        *(BOARD, torch.from_numpy(BOARD), BOARD.tolist(), BOARD[:, None], BOARD[None], [BOARD], BOARD.astype(">f4")),
-        *(REPEATED, REPEATED[:, None], REPEATED[:, :, None], REPEATED.tolist(), np.asfortranarray(BOARD)),
+        *(BOARD, torch.from_numpy(BOARD), BOARD.tolist(), BOARD[:, None], BOARD[None], [BOARD], REPEATED),
         *([BOARD] * 5, [BOARD[:, None]] * 5, [BOARD[None]] * 5, tuple(torch.from_numpy(BOARD) for _ in range(5))),
         torch.from_numpy(BOARD).requires_grad_(),
     ],
@@ -51,7 +50,7 @@ def test_forms_of_object_points(object_points):
 
 FORMS = [VIEWS, VIEWS[:, :, None], VIEWS[:, None], torch.from_numpy(VIEWS), torch.from_numpy(VIEWS).double()]
 FORMS += [torch.from_numpy(VIEWS).requires_grad_(), VIEWS.tolist(), list(VIEWS), tuple(torch.from_numpy(VIEWS))]
-FORMS += [[v[:, None] for v in VIEWS], [v[None] for v in VIEWS], [list(map(torch.from_numpy, v)) for v in VIEWS]]
+FORMS += [[v[:, None] for v in VIEWS], [v[None] for v in VIEWS]]
 
 
 @pytest.mark.parametrize("image_points", FORMS)
@@ -77,19 +76,16 @@ def test_numbers_of_all_kinds():
         same(as_observations(points, pixels, SIZE, OWNER), np.repeat(points[None], 5, 0), pixels)
 
 
-def test_nan_and_null_are_unseen_and_boards_may_lack_what_is_unseen():
+def test_nan_is_unseen_and_boards_may_lack_what_is_unseen():
     image_points, points = VIEWS.copy(), REPEATED.copy()
     image_points[1, 5:7] = image_points[0, 2] = image_points[1, 7, 0] = points[1, 5] = np.nan
-    null = image_points.tolist()
-    null[0][2], null[1][5], null[1][6] = [None, None], None, None
-    for given in (image_points, null):
-        observations, layout = as_observations(points, given, SIZE, OWNER)
-        assert (~observations.seen).nonzero().tolist() == [[0, 2], [1, 5], [1, 6], [1, 7]]
-        assert (observations.pixels[1, 5:8] == 0).all()
-        assert (observations.points[1, 5] == 0).all()
-        back, inliers = layout.restore(observations.pixels), layout.restore(torch.ones_like(observations.seen))
-        assert back[1][5:8].isnan().all()
-        assert not inliers[1][5:8].any()
+    observations, layout = as_observations(points, image_points, SIZE, OWNER)
+    assert (~observations.seen).nonzero().tolist() == [[0, 2], [1, 5], [1, 6], [1, 7]]
+    assert (observations.pixels[1, 5:8] == 0).all()
+    assert (observations.points[1, 5] == 0).all()
+    back, inliers = layout.restore(observations.pixels), layout.restore(torch.ones_like(observations.seen))
+    assert back[1][5:8].isnan().all()
+    assert not inliers[1][5:8].any()
 
 
 @pytest.mark.parametrize("empty", [None, np.empty((0, 2), np.float32), [], np.full((54, 2), np.nan)])
@@ -104,16 +100,6 @@ def test_views_without_corners_are_left_out(empty):
     assert len(back) == 5
     assert back[1].isnan().all()
     assert tuple(back[1].shape) == (np.shape(empty)[0] if empty is not None else 54, 2)
-
-
-@pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
-def test_copies_of_views_are_left_out(order):
-    points, image_points = [BOARD, BOARD, BOARD[order]], [VIEWS[0], VIEWS[1], VIEWS[0][order]]
-    with pytest.warns(UserWarning, match="view 2 left out, because the corners are those of another view$"):
-        observations, layout = as_observations(points, image_points, SIZE, OWNER)
-    same((observations, layout), REPEATED[:2], VIEWS[:2])
-    assert layout.copies == (2,)
-    assert layout.restore(observations.pixels)[2].isnan().all()
 
 
 def test_views_of_different_corners():
@@ -141,35 +127,26 @@ def changed(index, value):
 BAD = {
     "one view": (BOARD, VIEWS[0], ["image_points", "(V, N, 2)", "(54, 2)"]),
     "no view": (BOARD, [], ["image_points", "must have a view"]),
-    "nothing found": (BOARD, [None, None], ["image_points", "must have a view"]),
-    "no view in a tensor": (BOARD, VIEWS[:0], ["image_points"]),
     "nan": (BOARD, np.full_like(VIEWS, np.nan), ["got NaN in all views"]),
     "empty": (BOARD, [np.empty((0, 2))] * 3, ["must have seen corners"]),
     "few corners": (BOARD, changed((2, slice(3, None)), np.nan), ["view 2", "4 or more seen corners"]),
     "swapped axes": (BOARD, VIEWS.swapaxes(1, 2), ["image_points", "(V, N, 2)", "(5, 2, 54)"]),
-    "rows and columns": (BOARD, VIEWS[..., ::-1], ["lie in the image", "(480, 640)", "points are (u, v)"]),
+    "rows and columns": (BOARD, VIEWS[..., ::-1], ["in the image of", "(480, 640)", "points are (u, v)"]),
     "board size": (board(8, 6), VIEWS, ["view 0", "48 (inner", "got 54"]),
     "number of views": ([BOARD] * 4, VIEWS, ["'image_points': 5", "'object_points': 4"]),
     "exchanged": (VIEWS, REPEATED, ["image_points", "(V, N, 2)", "(5, 54, 3)"]),
     "no z": (BOARD[:, :2], VIEWS, ["object_points", "(N, 3)", "(54, 2)"]),
-    "one point": (0 * BOARD, VIEWS, ["object_points", "same point"]),
+    "one point": (0 * BOARD, VIEWS, ["object_points", "one point"]),
     "a line": (BOARD * np.float32([1, 0, 0]), VIEWS, ["object_points", "one line"]),
     "a line in one view": (BOARD, changed((3, slice(9, None)), np.nan), ["view 3", "one line"]),
-    "a slanted line": ((BOARD[:, :1] + BOARD[:, 1:2]) * np.float32([0.3, 0.7, 0.1]) + 5, VIEWS, ["one line"]),
-    "a corner twice": (np.concatenate((BOARD[:53], BOARD[:1])), VIEWS, ["object_points", "twice"]),
-    "pixels at zero": (BOARD, changed((1, slice(0, 3)), 0.0), ["view 1", "one pixel", "NaN"]),
-    "infinite": (BOARD, changed((2, 7), np.inf), ["view 2", "image_points", "infinite", "NaN"]),
+    "pixels at zero": (BOARD, changed((1, slice(0, 3)), 0.0), ["view 1", "NaN", "got (0, 0)"]),
+    "infinite": (BOARD, changed((2, 7), np.inf), ["view 2", "image_points", "finite", "NaN"]),
     "an infinite corner": (np.where(BOARD[-1] == BOARD, np.inf, BOARD), VIEWS, ["object_points", "finite"]),
     "a board without a corner": (np.where(BOARD[-1] == BOARD, np.nan, BOARD), VIEWS, ["object_points", "finite"]),
-    "a strange unit": (BOARD.astype(float) * 1e200, VIEWS, ["object_points", "unit", "got up to 2e+199"]),
-    "no values": (BOARD, torch.from_numpy(VIEWS).to("meta"), ["image_points", "meta"]),
-    "normalised": (BOARD, VIEWS / 640, ["normalised"]),
-    "outside": (BOARD, VIEWS * 3, ["image_points must lie in", "(480, 640)", "corners outside"]),
-    "another size in one view": (BOARD, changed(4, VIEWS[4] * 2), ["outside", "view 4", "all images"]),
-    "nowhere": (BOARD, changed((2, 7), 99999.0), ["1 of 270", "outside", "view 2", "(99999, 99999)"]),
+    "normalised": (BOARD, VIEWS / 640, ["pixels in the image", "from (0.03125, 0.015625) to (1, 0.601562)"]),
+    "outside": (BOARD, VIEWS * 3, ["image_points must be pixels in", "(480, 640)", "corners outside"]),
+    "another size in one view": (BOARD, changed(4, VIEWS[4] * 2), ["outside", "in view 4", "all images"]),
     "ragged": (BOARD, [[[1.0, 2.0], [3.0]]] * 5, ["image_points[0]"]),
-    "ragged rows": (BOARD, [[1.0, 2.0], [3.0]], ["image_points"]),
-    "too many dims": (BOARD, VIEWS[None, None], ["image_points", "(1, 1, 5, 54, 2)"]),
 }
 
 
@@ -183,11 +160,9 @@ NO_POINTS = [
     (BOARD, None, ["image_points", "NoneType"]),
     (None, VIEWS, ["object_points", "NoneType"]),
     (BOARD, ["a.jpg", "b.jpg"], ["image_points[0]", "tensor", "str"]),
-    (BOARD, {"left": VIEWS}, ["image_points", "rig"]),
-    ({"left": BOARD}, VIEWS, ["object_points", "dict"]),
+    (BOARD, {"left": VIEWS}, ["image_points", "dict"]),
     (BOARD, VIEWS > 0, ["image_points", "bool"]),
     (BOARD, torch.from_numpy(VIEWS) + 0j, ["image_points", "complex"]),
-    (BOARD, 5 + 0j, ["image_points", "complex"]),
 ]
 
 
@@ -202,7 +177,7 @@ def test_sizes_of_images():
         assert as_observations(BOARD, VIEWS, size, OWNER)[1].image_size == SIZE
     with refuses("image_size", "(640, 480)", "is (height, width)"):
         as_observations(BOARD, VIEWS, (640, 480), OWNER)
-    with refuses("image_size", "must be given", "(height, width)"):
+    with refuses("image_size", "(height, width)", "None", error=TypeError):
         as_observations(BOARD, VIEWS, None, OWNER)
 
 
@@ -244,20 +219,18 @@ def rig(left, right):
 
 
 BAD_RIGS = [
-    ({"image_points": {"left": VIEWS}}, ["same cameras", "image_points of ['left']", "models of ['left', 'right']"]),
-    ({"image_sizes": {"left": SIZE, "rihgt": SIZE}}, ["same cameras", "got image_sizes of ['left', 'rihgt']"]),
-    ({"models": {"left": "mei"}}, ["same cameras", "['left', 'right']", "models of ['left']"]),
-    ({"models": {}}, ["same cameras", "got models of []"]),
+    ({"image_points": {"left": VIEWS}}, ["same names", "image_points of ['left']"]),
+    ({"image_sizes": {"left": SIZE, "rihgt": SIZE}}, ["same names", "got image_sizes of ['left', 'rihgt']"]),
+    ({"models": {"left": "mei"}}, ["same names", "image_points of ['left', 'right']"]),
+    ({"models": {}}, ["same names", "got models of []"]),
     (rig(VIEWS, VIEWS[:4]), ["same views", "left", "5", "right", "4"]),
-    (rig(VIEWS, [None] * 5), ["image_points['right']", "must have a view"]),
-    (rig(VIEWS, VIEWS * np.nan), ["image_points['right']", "NaN in all views"]),
-    ({"image_sizes": {"left": SIZE, "right": (640, 480)}}, ["image_sizes['right'] is (height, width)"]),
-    ({"image_sizes": {"left": SIZE, "right": None}}, ["image_sizes['right']", "must be given"]),
-    (rig(VIEWS, VIEWS[:, :48]), ["view 0", "image_points['right'][0]", "54", "48"]),
-    (rig(VIEWS, changed((1, slice(2, None)), np.nan)), ["view 1", "image_points['right']"]),
+    (rig(VIEWS, [None] * 5), ["right", "must have a view"]),
+    (rig(VIEWS, VIEWS * np.nan), ["right", "NaN in all views"]),
+    ({"image_sizes": {"left": SIZE, "right": (640, 480)}}, ["right", "image_size is (height, width)"]),
+    (rig(VIEWS, VIEWS[:, :48]), ["right: view 0", "54", "48"]),
+    (rig(VIEWS, changed((1, slice(2, None)), np.nan)), ["right: view 1", "image_points"]),
     (rig([*VIEWS[:3], None, None], [None, None, None, *VIEWS[3:]]), ["share views with 'left'", "view of 'right'"]),
-    ({"image_points": [VIEWS, VIEWS]}, ["image_points", "names of cameras", "list"]),
-    ({"image_points": {0: VIEWS}, "image_sizes": {0: SIZE}, "models": {0: None}}, ["names of cameras", "0"]),
+    ({"image_points": [VIEWS, VIEWS]}, ["names of cameras", "list"]),
 ]
 
 

@@ -1,6 +1,5 @@
 """What a calibration says of itself: warnings where data do not carry it, none where they do, and a verdict."""
 
-import contextlib
 import re
 
 import pytest
@@ -57,14 +56,13 @@ def test_good_data_have_no_warnings():
     assert result.warnings == []
     assert "!" not in repr(result)
     assert re.match(r"Good for measuring up to 4\d degrees from the optical axis, 100 % of the image", result.verdict)
-    assert "It needs no more views" in result.verdict
+    assert "Four times as many views" in result.verdict
 
 
 def test_real_corners(left):
-    assert "top left" in one(left.warnings, "Few corners")
-    assert "28 degrees" in one(left.warnings, "Corners reach 2")
+    assert "bottom left, the top left" in one(left.warnings, "28 degrees .* 41 degrees. The lens is a guess in")
     assert "up to 31 degrees" in left.verdict
-    assert "Next, hold the board in the top left" in left.verdict
+    assert "Next, hold the board in the bottom left, the top left and" in left.verdict
     assert all(f"  ! {text}" in repr(left) for text in left.warnings)
     assert repr(left).endswith(left.verdict)
 
@@ -72,18 +70,17 @@ def test_real_corners(left):
 @pytest.mark.slow
 def test_what_is_well_is_no_warning():
     corners, *_ = seen_by(FISHEYE, 40, noise=0.15, near=0.1, far=0.3)
-    assert not [text for text in found("kannala_brandt", corners).warnings if "ends inside" in text]
+    assert not [text for text in found("kannala_brandt", corners).warnings if "the lens ends" in text]
     wide = found("kannala_brandt", ov_plane("train"))
     assert wide.warnings == []
     assert 88 <= int(re.search(r"Good for measuring up to (\d+) degrees", wide.verdict)[1]) <= 92
 
 
-MIDDLE = ["Few corners or none in the top left", "beyond the corners the lens is a guess"]
-PARALLEL = ["known to .* % only. All boards are parallel to within .*Tilt the board"]
+MIDDLE = ["The lens is a guess in the .*left"]
+PARALLEL = ["All boards are parallel to within .*Tilt the board"]
 NOT_CARRIED = {
     "corners in the middle": (0.15, {"count": 20, "width": 0.02, "distance": 0.8}, MIDDLE, "up to 1.*Next, hold"),
     "parallel boards": (0.5, {"count": 15, "tilt": 0.1}, PARALLEL, "Tilt the board"),
-    "a loose principal point": (0.5, {"count": 8, "tilt": 0.15}, [r'point is known to.*fixed=\("cx", "cy"\)'], ""),
     "another model": (0.15, {"count": 25}, ["The residuals have a pattern.*brown_conrady"], ""),
     "noise that is no noise": (3.0, {"count": 20}, ["Residuals are 3 px per coordinate"], ""),
 }
@@ -112,17 +109,14 @@ def test_outliers_and_bad_views():
     one(result.warnings, "The rms of view.* is usual")
     robust = found("brown_conrady", (board, pixels), loss="cauchy", loss_scale=0.5)
     assert "loss=" not in one(robust.warnings, "11 of .* corners are outliers")
-    pixels[5] = pixels[5, torch.randperm(54, generator=torch.Generator().manual_seed(0))]
-    shuffled = found("brown_conrady", (board, pixels), loss="huber")
-    one(shuffled.warnings, "Nearly all corners of view 5 are outliers.*numbered in another order.*less certain")
 
 
 def test_a_search_that_did_not_end(monkeypatch):
     monkeypatch.setattr(calibrate, "STEPS", 0)
     with pytest.warns(UserWarning, match="did not end at an optimum"):
         result = found("brown_conrady", views(NARROW, *all_over(3)))
-    one(result.warnings, "do not use this camera")
-    assert "do not use this camera" in result.verdict
+    one(result.warnings, "Do not use this camera")
+    assert "Do not use this camera" in result.verdict
     assert "NOT CONVERGED" in repr(result)
 
 
@@ -132,7 +126,7 @@ def test_a_search_that_did_not_end(monkeypatch):
 def test_a_single_view_of_a_plane(key, tilt):
     rotation = rotation_matrix(torch.tensor([[tilt, tilt / 2, 0.0]], **F64))
     corners = views(NARROW, rotation, torch.tensor([[0.0, 0, 0.4]], **F64))
-    words = r"views must determine .*; got a single view of this board\. Take 10 to 20 views"
+    words = r"views must determine the camera; got a single view of this board\. Take 10 to 20 views"
     with pytest.raises(ValueError, match=words) as raised:
         found(key, corners)
     # what it says can be done
@@ -146,33 +140,24 @@ def test_planes_across_the_axis(count, noise):
     pinhole = ct.Pinhole(torch.tensor([530.0, 530, 320, 240], **F64), image_size=SIZE)
     board, pixels = views(pinhole, *all_over(6, tilt=0.0), noise)
     got = "a single view" if count == 1 else f"{count} views"
-    with pytest.raises(ValueError, match=rf"views must determine fx\b.*; got {got}"):
+    with pytest.raises(ValueError, match=f"views must determine the camera; got {got}"):
         found("pinhole", (board, pixels[:count]))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["in another order", "saved again"])
-def test_copies_of_views_count_once(how):
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_copies_of_views_count_once(noise):
+    """They widen the uncertainties as if they were missing."""
     board, pixels = views(NARROW, *all_over(5))
     pixels[2, 7] = torch.nan
     alone = ct.calibrate("pinhole", board, pixels[:4], image_size=SIZE)
-    again = pixels[:4].clone()
-    if how == "saved again":
-        again += 0.01 * torch.randn(again.shape, generator=torch.Generator().manual_seed(5), **F64)
-    order = torch.arange(len(board)).flip(0) if how == "in another order" else torch.arange(len(board))
-    image_points = [*pixels[:4], *again[:, order]]
-    object_points = [board] * 4 + [board[order]] * len(again)
-    said = contextlib.nullcontext() if how == "saved again" else pytest.warns(UserWarning, match="4, 5, 6, 7 left")
-    with said:
-        result = ct.calibrate("pinhole", object_points, image_points, image_size=SIZE)
-    assert result.copies == tuple(range(4, 8))
-    # saved again they widen what all views say alike
-    torch.testing.assert_close(result.std, alone.std, rtol=0.05 if how == "saved again" else 1e-9, atol=0)
-    one(result.warnings, "Copies .*, are views 4, 5, 6, 7.* count once")
+    again = pixels[:4] + noise * torch.randn(pixels[:4].shape, generator=torch.Generator().manual_seed(5), **F64)
+    result = ct.calibrate("pinhole", board, torch.cat((pixels[:4], again)), image_size=SIZE)
+    assert len(result.copies) == 4
+    assert {copy % 4 for copy in result.copies} == {0, 1, 2, 3}
+    torch.testing.assert_close(result.std, alone.std, rtol=0.05, atol=0)
+    one(result.warnings, "Copies .*, are views .* count once")
     assert "Take 10 to 20" in one(result.warnings, r"Few views \(4\)")
-    if how != "saved again":
-        assert result.views == (0, 1, 2, 3)
-        assert result.residuals[4].isnan().all()
 
 
 @pytest.mark.slow
@@ -181,17 +166,3 @@ def test_photographs_from_a_tripod_are_no_copies():
     result = found("pinhole", views(NARROW, rotations.repeat(5, 1, 1), translations.repeat(5, 1)))
     assert result.copies == ()
     assert not [text for text in result.warnings if "again" in text]
-
-
-@pytest.mark.slow
-def test_double_spheres_have_twins():
-    sphere = lens(ct.DoubleSphere, (317.0, 317.0, 320, 240), 0.3, 0.6)
-    corners, *_ = seen_by(sphere, 8, noise=0.2)
-    result = found("double_sphere", corners)
-    optima = [result.spread.parameters[0].tolist(), *result.twins]
-    assert min(optimum[4] for optimum in optima) < -0.1
-    assert max(optimum[4] for optimum in optima) > 0.2
-    text = one(result.warnings, "The parameters are not known, only projections near")
-    assert all(f"fx {optimum[0]:.4g}, xi {optimum[4]:.4g}" in text for optimum in optima)
-    # corners without noise tell them apart
-    assert found("double_sphere", seen_by(sphere, 6)[0]).twins == ()
