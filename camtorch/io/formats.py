@@ -1,6 +1,11 @@
 """`load` and `save`: each format decides whether a file is its own; formats are known only by their modules.
 
-To add a format, write one file in this folder that follows the protocols, and name it in one of the lists below.
+To add a format, write a file in this folder and name it in one of the lists below. It has `NAMES: Names`, and
+* `matches(keys: dict[str, Any]) -> bool` and `parse(record: Record) -> Rig`, if a file is keys and values of YAML,
+  JSON, XML or a NumPy archive; else `matches(path: str, content: bytes) -> bool` and `read(path, content) -> Rig`,
+  which may read files in the same folder too, all in float64;
+* `render(rig: Rig, lossy: Lossy) -> str | dict[str, bytes]`, if it is written: the text of a file, or files by path.
+Values that it cannot read or hold raise CameraFileError, as by `record.fail`.
 """
 
 from __future__ import annotations
@@ -11,7 +16,7 @@ import json
 import os
 import re
 from collections.abc import Mapping
-from typing import IO, Any, Protocol, TypeVar
+from typing import IO, Any, TypeVar
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
@@ -41,36 +46,9 @@ from camtorch.values.arguments import LEFT, shown
 Kind = TypeVar("Kind", bound=Camera)
 
 
-class Format(Protocol):
-    """Interface of a format's module. Values that it cannot read or hold raise CameraFileError, as by `record.fail`."""
-
-    @property
-    def NAMES(self) -> Names: ...  # noqa: N802
-
-
-class KeyFormat(Format, Protocol):
-    """Interface of a module that reads keys and values of YAML, JSON, XML or NumPy archives."""
-
-    def matches(self, keys: dict[str, Any]) -> bool: ...
-    def parse(self, record: Record) -> Rig: ...
-
-
-class ContentFormat(Format, Protocol):
-    """Interface of a module that reads other kinds of files, and files in the same folder, in float64."""
-
-    def matches(self, path: str, content: bytes) -> bool: ...
-    def read(self, path: str, content: bytes) -> Rig: ...
-
-
-class WrittenFormat(Format, Protocol):
-    """Interface of a module that writes: the text of one file, or the contents of several or binary files by path."""
-
-    def render(self, rig: Rig, lossy: Lossy) -> str | dict[str, bytes]: ...
-
-
 # formats that are read, in the order in which they are tried
-_BY_CONTENT: tuple[ContentFormat, ...] = (colmap, metashape, nuscenes, ocamcalib)
-_BY_KEYS: tuple[KeyFormat, ...] = (
+_BY_CONTENT: tuple[Any, ...] = (colmap, metashape, nuscenes, ocamcalib)
+_BY_KEYS: tuple[Any, ...] = (
     camtorch_json,
     aria,
     basalt,
@@ -89,7 +67,6 @@ READ: dict[str, Names] = {format: module.NAMES for format, module in _MODULES.it
 WRITTEN = {format: READ[format] for format, module in _MODULES.items() if hasattr(module, "render")}
 FORMATS = tuple(READ)
 _CONTENT = r"""\n|\{['"]|<\?|\0\0|PK\x03"""  # in no path
-_OPENMVG = "must not be OpenMVG's; got its scene. openMVG_main_openMVG2Colmap writes it in COLMAP's format"
 
 
 def load(path: str | os.PathLike[str] | IO[str] | IO[bytes], format: str | None = None) -> Rig:
@@ -137,10 +114,7 @@ def load(path: str | os.PathLike[str] | IO[str] | IO[bytes], format: str | None 
         names = [name for names in READ.values() for name in names.in_folder]
         found = next((name for name in names if os.path.exists(os.path.join(path, name))), None)
         if found is None:
-            suffixes = tuple(suffix for names in READ.values() for suffix in names.suffixes)
-            there = ", ".join(repr(name) for name in sorted(os.listdir(path)) if name.endswith(suffixes))
-            hint = f". Name a file, such as {there:.200}" if there else ""
-            raise CameraFileError(path, "folder", f"must have one of {', '.join(names)}; got none{hint}")
+            raise CameraFileError(path, "folder", f"must have one of {', '.join(names)}; got none. Name its file")
         path = os.path.join(path, found)
     return _loaded(path, read_bytes(path), format)
 
@@ -205,13 +179,8 @@ def _read(path: str, content: str | bytes | Mapping[str, Any] | list[Any], forma
     for by_keys in _BY_KEYS:
         if format == by_keys.NAMES.format or (format is None and by_keys.matches(keys)):
             return by_keys.parse(Record(path, keys)), by_keys.NAMES.format
-    if "sfm_data_version" in keys:
-        raise CameraFileError(path, "content", _OPENMVG)
-    shown = ", ".join(f"{key!r:.30}" for key in list(keys)[:5]) or "none"
-    if "fx" in keys:
-        way = "ct.BrownConrady([fx, fy, cx, cy], [k1, k2, p1, p2], image_size=(height, width))"
-        shown += f". A camera of numbers is {way}"
-    raise CameraFileError(path, "content", f"keys must be those of a known format; got {shown}")
+    first = ", ".join(f"{key!r:.30}" for key in list(keys)[:5]) or "none"
+    raise CameraFileError(path, "content", f"keys must be those of a known format; got {first}")
 
 
 def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = None) -> None:
@@ -261,19 +230,15 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
     if not rig.cameras:
         raise ValueError(f"{path}: rig must have a camera; got none")
     for name, camera in rig.cameras.items():
-        if camera.is_mixed:
-            by_name = "ct.Rig({f'camera{i}': one for i, one in enumerate(camera)})"
-            raise TypeError(f"{path}: {name} must be of one model; got a Mixed. Save {by_name}")
-        if not camera.key:
-            raise TypeError(f"{path}: {name} must be of a model with a key; got {type(camera).__name__}")
+        if not camera.key:  # as of a Mixed
+            raise TypeError(f"{path}: {name} must be of one model with a key; got {type(camera).__name__}")
     format = _known(format, WRITTEN, "written") or _format_of(rig, path)
     if os.path.isdir(path):
         if not (inside := [os.path.join(path, name) for name in WRITTEN[format].in_folder]):
             raise ValueError(f"{path}: path must be a file for {format}; got a folder. Add a name")
         path = next(filter(os.path.exists, inside), inside[-1])
     try:
-        module: WrittenFormat = _MODULES[format]
-        found = module.render(rig, Lossy(path, module.NAMES.title))
+        found: str | dict[str, bytes] = _MODULES[format].render(rig, Lossy(path, WRITTEN[format].title))
         return {path: found.encode()} if isinstance(found, str) else found
     except UnicodeEncodeError as error:
         raise CameraFileError(path, "names", f"must be text that a file can hold; got {error.object!r:.60}") from None
@@ -283,9 +248,8 @@ def _known(format: str | None, there: dict[str, Names], done: str) -> str | None
     name = None if format is None else str(format).lower()
     if name is None or name in there:
         return name
-    reason = f"which is not {done}" if name in FORMATS else "which is unknown"
-    left = "" if name in FORMATS else f". {LEFT}"
-    raise ValueError(f"format must be one of {', '.join(sorted(there))}; got {format!r}, {reason}{left}")
+    reason = f"which is not {done}" if name in FORMATS else f"which is unknown. {LEFT}"
+    raise ValueError(f"format must be one of {', '.join(sorted(there))}; got {format!r}, {reason}")
 
 
 def _format_of(rig: Rig, path: str) -> str:
@@ -295,9 +259,7 @@ def _format_of(rig: Rig, path: str) -> str:
     formats = sorted(names.format for names in fitting)
     if rig.format is not None and rig.format in formats:
         return rig.format
-    if folder:
-        raise ValueError(f"{path}: must be a file; got a folder. Write {' or '.join(f'format={f!r}' for f in formats)}")
-    patterns = {pattern: names.format for names in fitting for pattern in names.patterns}
+    patterns = {pattern: names.format for names in fitting for pattern in names.patterns if not folder}
     if meant := [pattern for pattern in patterns if fnmatch.fnmatchcase(file, pattern)]:
         return patterns[max(meant, key=len)]
     may = f"got one that fits {', '.join(formats) or 'none of ' + ', '.join(sorted(WRITTEN))}"
