@@ -125,15 +125,14 @@ def as_board(board: Any, square: float, options: dict[str, Any], owner: str) -> 
         raise ValueError(f"{owner}: {kind.kind} options must be {', '.join(known) or 'none'}; got {', '.join(strange)}")
     options = ({"marker": 0.75 * square} if kind is Charuco else {}) | options
     found = kind(int(match[2]), int(match[3]), square, **options)
-    if min(found.columns, found.rows) < kind.least:
-        least, got = f"{kind.least}x{kind.least}", f"{found.columns}x{found.rows}"
-        raise ValueError(f"{owner}: a board must have at least {least} {kind.counted}; got {got}")
-    if not 0 < square < float("inf"):
-        raise ValueError(f"{owner}: lengths must be positive and finite; got {square:g}")
-    if isinstance(found, Charuco) and not 0 < found.marker < square:
-        raise ValueError(f"{owner}: a marker must be smaller than its square; got {found.marker:g} in {square:g}")
-    if isinstance(found, AprilGrid) and not 0 < found.spacing <= 2:
-        raise ValueError(f"{owner}: spacing must be a part of a side, above 0 and at most 2; got {found.spacing:g}")
-    if isinstance(found, AprilGrid) and found.border not in (1, 2, 3):
-        raise ValueError(f"{owner}: a tag's border must be 1, 2 or 3 cells; got {found.border}")
+    rules: list[tuple[bool, str]] = [
+        (min(found.columns, found.rows) < kind.least, f"must have at least {kind.least}x{kind.least} {kind.counted}"),
+        (not 0 < square < float("inf"), "must have positive, finite lengths"),
+        (isinstance(found, Charuco) and not 0 < found.marker < square, "must have markers smaller than its squares"),
+        (isinstance(found, AprilGrid) and not 0 < found.spacing <= 2, "must have a spacing above 0, at most 2 sides"),
+        (isinstance(found, AprilGrid) and found.border not in (1, 2, 3), "must have a border of 1, 2 or 3 cells"),
+    ]
+    for is_broken, rule in rules:
+        if is_broken:
+            raise ValueError(f"{owner}: a board {rule}; got {found}")
     return found

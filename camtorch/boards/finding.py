@@ -57,7 +57,7 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
 
     Args:
         images: A path, a folder, a pattern such as "photos/*.jpg", or a list of these; an array (H, W) or (H, W, C) or
-            a tensor (C, H, W), uint8, uint16 or floating point from 0 to 1, a stack or a list of them; Pillow images.
+            a tensor (C, H, W), uint8 or uint16, a stack or a list of them; Pillow images.
         board: "9x6" or (9, 6), inner corners of a chessboard; "charuco 5x7", squares; "aprilgrid 6x6", tags.
         square: The side of a square, or of a tag, in the unit of the poses.
         options: `marker`, `dictionary`, `legacy` of ChArUco; `spacing`, `border`, `dictionary` of an AprilGrid.
@@ -179,10 +179,6 @@ def _grey_of(image: Any, weights: Sequence[float], name: str = "image") -> NDArr
         raise ValueError(f"{_OWNER}: {name} must be {forms}; got {tuple(image.shape)}")
     if array.ndim == 3 and isinstance(image, torch.Tensor):
         array = np.moveaxis(array, 0, -1)
-    if array.dtype.kind == "f":
-        if float(array.max()) > 1:
-            raise ValueError(f"{_OWNER}: {name} must be 0 to 1 if floating point; got up to {float(array.max()):g}")
-        array = np.rint(255 * array).astype(np.uint8)
     if array.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{_OWNER}: {name} must be uint8 or uint16; got {array.dtype}")
     if array.ndim == 3 and array.shape[-1] > 2:

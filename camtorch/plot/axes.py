@@ -11,7 +11,6 @@ from camtorch.values.arguments import imported
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.colors import ListedColormap
     from matplotlib.quiver import Quiver
 
     from camtorch.cameras.camera import Camera
@@ -19,9 +18,6 @@ if TYPE_CHECKING:
 INK, GREY, PALE = "#2b2a2e", "#8a8378", "#efe9dd"
 COLOURS = ("#1e64f0", "#e21d48", "#0b8a5f", "#b86e00", "#7a3fc2", "#5a6472")  # of cameras; the second also for marks
 NO_RAYS = "#d9d4ca"  # for pixels without a value
-# matplotlib's colour maps, and the part of each from the palest colour to the darkest
-_LEVELS = {"counts": ("Blues", 0.2, 0.75), "residuals": ("viridis", 0.85, 0.05), "uncertainty": ("magma", 0.95, 0.2)}
-_LEVELS |= {"distortion": ("viridis_r", 0.15, 1)}
 
 
 def require_matplotlib() -> None:
@@ -65,9 +61,9 @@ def draw_frame(ax: Axes, height: int, width: int) -> tuple[float, float, float, 
     return -0.5, width - 0.5, height - 0.5, -0.5
 
 
-def draw_arrows(ax: Axes, *planes: np.ndarray, colours: str, **options: Any) -> Quiver:
+def draw_arrows(ax: Axes, *planes: np.ndarray, **options: Any) -> Quiver:
     """Draw arrows in the image's pixels: u and v of their starts and of their lengths, and values for colours."""
-    return ax.quiver(*planes, cmap=levels(colours), angles="xy", scale_units="xy", scale=1, width=0.0025, **options)
+    return ax.quiver(*planes, cmap="viridis_r", angles="xy", scale_units="xy", scale=1, width=0.0025, **options)
 
 
 def magnification(most: float) -> int:
@@ -81,12 +77,3 @@ def magnification(most: float) -> int:
 def printable(name: str) -> str:
     """Return a name without characters that fonts cannot draw, as control characters and lone surrogates."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
-
-
-def levels(name: str, count: int = 256) -> ListedColormap:
-    """Return the colours of a palette of `_LEVELS`, from low to high values."""
-    from matplotlib import colormaps
-    from matplotlib.colors import ListedColormap
-
-    source, start, end = _LEVELS[name]
-    return ListedColormap(colormaps[source](np.linspace(start, end, count)))

@@ -26,7 +26,6 @@ from camtorch.plot.axes import (
     check_single,
     draw_arrows,
     draw_frame,
-    levels,
     magnification,
     printable,
     require_matplotlib,
@@ -89,7 +88,7 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
         if float(length.max()) < _NOTHING:
             along, length, longer = 0 * along, 0 * length, 1
         planes = [plane.numpy(force=True) for plane in (*(end - longer * along).T, *(longer * along).T, length)]
-        _bar(ax, draw_arrows(ax, *planes, colours="distortion", headwidth=4, headlength=5, zorder=3), length)
+        _bar(ax, draw_arrows(ax, *planes, headwidth=4, headlength=5, zorder=3), length)
     cx, cy = camera.intrinsics[2:].tolist()
     ax.plot([cx], [cy], "+", color=COLOURS[1], markersize=11, markeredgewidth=1.6, zorder=4)
     times = f", {longer} times as long" if longer > 1 else ""
@@ -211,7 +210,7 @@ def _draw_residuals(ax: Axes, calibration: Calibration, pixels: np.ndarray, erro
     usual = float(np.quantile(lengths, 0.98)) if len(lengths) else 0.0
     longer = magnification(0.05 * max(height, width) / max(usual, 1e-9))
     planes = *pixels[some].T, *errors[some].T * longer, lengths[some]
-    arrows = draw_arrows(ax, *planes, colours="residuals", clim=(0, usual or 1.0))
+    arrows = draw_arrows(ax, *planes, clim=(0, usual or 1.0))
     ax.figure.colorbar(arrows, ax=ax, label="px", shrink=0.8, pad=0.02, extend="max")
     less = "" if len(some) == len(lengths) else f" of {len(lengths):,}"
     ax.set_title(f"{head}residuals of {len(some):,}{less} corners, {longer:,} times as long")
@@ -224,20 +223,14 @@ def _draw_uncertainty(ax: Axes, calibration: Calibration, head: str) -> None:
     pixels = image_lattice(calibration.camera, rows, columns).double()
     values = np.ma.masked_invalid(calibration.uncertainty(pixels).double().numpy(force=True))
     ax.fill_between([-0.5, width - 0.5], -0.5, height - 0.5, color=NO_RAYS, linewidth=0, zorder=0.5)
-    ax.set_title(f"{head}sigma of a projection")
+    ax.set_title(f"{head}sigma of a projection at infinity, median {np.nanmedian(values.filled(np.nan)):.2g} px")
     if values.count():
-        # bounds from 1, 2, 5, 10, ... around most values
-        low, high = (math.log10(max(value, 1e-6)) for value in np.quantile(values.compressed(), (0.01, 0.97)))
-        powers = range(math.floor(low), math.ceil(high) + 1)
-        ladder = [float(f"{digit}e{power}") for power in powers for digit in (1, 2, 5)]
-        first = max(i for i, bound in enumerate(ladder) if i == 0 or bound <= 10**low)
-        last = next((i for i, bound in enumerate(ladder) if bound >= 10**high and i > first), len(ladder) - 1)
-        bounds = ladder[first : min(last, first + _BANDS) + 1]
+        low, high = np.quantile(values.compressed(), (0.01, 0.97)).clip(1e-6)
+        ladder = (float(f"{digit}e{power}") for power in range(-7, 9) for digit in (1, 2, 5))
+        bounds = [bound for bound in ladder if low / 2.5 < bound < high * 2.5][: _BANDS + 1]
         u, v = pixels[0, :, 0].numpy(force=True), pixels[:, 0, 1].numpy(force=True)
-        colours = levels("uncertainty", len(bounds)).colors
-        bands = ax.contourf(u, v, np.ma.maximum(values, bounds[0]), bounds, colors=colours, extend="max", zorder=1)
+        bands = ax.contourf(u, v, np.ma.maximum(values, bounds[0]), bounds, cmap="magma_r", extend="max", zorder=1)
         ax.figure.colorbar(bands, ax=ax, label="px", format="%g", shrink=0.8, pad=0.02)
-        ax.set_title(f"{head}sigma of a projection at infinity, median {np.median(values.compressed()):.2g} px")
 
 
 def portrait(camera: Camera, other: Camera | None = None, *, title: str = "") -> Figure:
