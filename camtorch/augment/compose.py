@@ -56,8 +56,7 @@ class Compose(Augmentation):
         for part in parts:
             if not isinstance(part, Augmentation):
                 raise TypeError(
-                    f"{name}: augmentations must be a list of augmentations of camtorch; got {type(part).__name__}. "
-                    "Those of other libraries go before or after, in nn.Sequential or their own containers"
+                    f"{name}: augmentations must be a list of augmentations of camtorch; got {type(part).__name__}"
                 )
         if not parts:
             raise ValueError(f"{name}: augmentations must hold at least one; got an empty list")
@@ -71,13 +70,10 @@ class Compose(Augmentation):
             options.setdefault("valid_mask", True)
         ranges: dict[str, Range] = {}
         for i, part in enumerate(parts):
-            ranges[f"{i}.apply"] = Range(0, 1)
-            ranges |= {f"{i}.{key}": interval for key, interval in part.ranges.items()}
+            ranges |= {f"{i}.{key}": interval for key, interval in [("apply", Range(0, 1)), *part.ranges.items()]}
         super().__init__(ranges, **options)
         self.augmentations = nn.ModuleList(parts)
-        self.crops: Mapping[str, int] = {
-            f"{i}.{key}": index for i, part in enumerate(parts) for key, index in part.crops.items()
-        }
+        self.crops = {f"{i}.{key}": index for i, part in enumerate(parts) for key, index in part.crops.items()}
         self.needs_camera: bool = any(part.needs_camera for part in parts)
         self.drawn_on_host: bool = all(part.drawn_on_host for part in parts)
         self._check_options(parts)
@@ -87,32 +83,28 @@ class Compose(Augmentation):
         self.mirroring: Mirroring | None = next(iter(mirrorings.values()), None)
 
     def _check_options(self, parts: Sequence[Augmentation]) -> None:
-        usual = Augmentation().options
+        usual = {**Augmentation().options, "mask_fill": 0.0}
+        wanted = {**self.options, "mask_fill": self.mask_fill}
         for i, part in enumerate(parts):
             given = {**part.options, "mask_fill": part.mask_fill}
-            wanted = {**self.options, "mask_fill": self.mask_fill}
             for key in (*_OF_IMAGES, "mask_fill"):
-                if given[key] not in ({**usual, "mask_fill": 0.0}[key], wanted[key]):
+                if given[key] not in (usual[key], wanted[key]):
                     raise ValueError(
                         f"{self._name}: images are sampled once, so parts must have one {key}; got {given[key]!r} of "
                         f"{type(part).__name__}. Pass it to {self._name} itself"
                     )
-            drawn = {key.rpartition(".")[2] for key in part.ranges}
-            if "shift_x" in drawn:
-                raise ValueError(
-                    f"{self._name}: parts must have no shift; {type(part).__name__}, which needs depth, goes before"
-                )
-            if "rates" in drawn and parts[i + 1 :]:
-                raise ValueError(
-                    f"{self._name}: a rolling shutter must be last, or later parts move its rows; got it at place {i}. "
-                    f"{type(part).__name__} goes last"
-                )
+            drawn, later = {key.rpartition(".")[2] for key in part.ranges}, parts[i + 1 :]
             coloured = {"chromatic", "vignetting", "cos4"} & drawn
-            if coloured and any(later.needs_camera and not later.keeps_lens for later in parts[i + 1 :]):
-                raise ValueError(
-                    f"{self._name}: parts after the {' and '.join(sorted(coloured))} of {type(part).__name__} must be "
-                    "edits; got another lens, through which it would be seen"
-                )
+            for wrong, reason in (
+                ("shift_x" in drawn, "have no shift, which needs depth; call it before"),
+                ("rates" in drawn and later, "end with the rolling shutter, or later parts move its rows"),
+                (
+                    coloured and any(one.needs_camera and not one.keeps_lens for one in later),
+                    f"be edits after {' and '.join(sorted(coloured))}, which another lens would show",
+                ),
+            ):
+                if wrong:
+                    raise ValueError(f"{self._name}: parts must {reason}; got {type(part).__name__} at place {i}")
 
     @property
     def parts(self) -> list[Augmentation]:

@@ -18,7 +18,7 @@ from camtorch.augment.ranges import Range, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited, quarter_turns
 from camtorch.evaluate.known import known_false, known_true
-from camtorch.values.arguments import as_image_size, as_whole
+from camtorch.values.arguments import as_known_size, as_whole
 from camtorch.warp.affine import AffineWarp, Map, Rows, after, as_tensor, on_rays
 
 Size = int | Sequence[int]
@@ -235,10 +235,8 @@ class Resize(Edit):
     def __init__(self, size: Size, **options: Unpack[EditOptions]):
         super().__init__(**options)
         alone = size[0] if isinstance(size, Sequence) and len(size) == 1 else size  # torchvision's (256,) is 256
-        self.shorter = None if isinstance(alone, Sequence) else as_whole(alone, "size", self._name)
+        self.shorter = None if isinstance(alone, Sequence) else as_whole(alone, "size", self._name, least=1)
         self.image_size: tuple[int, int] | None = _as_size(size, self._name) if self.shorter is None else None
-        if self.shorter is not None and self.shorter < 1:
-            raise ValueError(f"{self._name}: size must be positive; got {size!r}")
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         height, width = size
@@ -270,10 +268,8 @@ class Pad(Edit):
             given = tuple(padding) if isinstance(padding, Sequence) else (padding,)
             sides = tuple(as_whole(side, "padding", self._name) for side in given)
             if len(sides) not in (1, 2, 4) or min(sides) < 0:
-                raise ValueError(
-                    f"{self._name}: padding must be one number, (across, down) or (left, top, right, bottom), and none "
-                    f"negative; got {padding!r}. CenterCrop crops"
-                )
+                form = "one number, (across, down) or (left, top, right, bottom), and none negative"
+                raise ValueError(f"{self._name}: padding must be {form}; got {padding!r}")
             self.padding = sides * (4 // len(sides))
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
@@ -302,15 +298,11 @@ class Rotate90(Edit):
 
     def __init__(self, times: int | Sequence[int] = (0, 3), *, step: int = 1, **options: Unpack[EditOptions]):
         name = type(self).__name__
-        ends = tuple(times) if isinstance(times, Sequence) else (times, times)
-        if len(ends) != 2:
-            raise ValueError(f"{name}: times must be one number or (least, most); got {times!r}")
-        low, high = (as_whole(end, "times", name) for end in ends)
-        if low > high or as_whole(step, "step", name) < 1:
-            raise ValueError(f"{name}: times must be (least, most), and step positive; got {times!r} and {step!r}")
-        if low <= -90 or high >= 90:
-            raise ValueError(f"{name}: times must be quarter turns; got {times!r}. Divide degrees by 90")
-        self.times = low, high, step
+        given = times if isinstance(times, Sequence) else (times, times)
+        ends = tuple(as_whole(end, "times", name) for end in given)
+        if len(ends) != 2 or not -90 < ends[0] <= ends[1] < 90:
+            raise ValueError(f"{name}: times must be quarter turns, one number or (least, most); got {times!r}")
+        self.times = ends[0], ends[1], as_whole(step, "step", name, least=1)
         super().__init__({"times": Range(0, 1)}, **options)
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
@@ -381,11 +373,5 @@ class VerticalFlip(_Flip):
 
 def _as_size(size: Size, owner: str) -> tuple[int, int]:
     """Return (height, width); one number makes a square."""
-    try:
-        sides = tuple(size) if isinstance(size, Sequence) else (size,)
-        made = as_image_size(sides * 2 if len(sides) == 1 else sides, owner, "size")
-    except TypeError:
-        made = None
-    if made is None:
-        raise TypeError(f"{owner}: size must be whole numbers (height, width), or one for a square; got {size!r}")
-    return made
+    sides = tuple(size) if isinstance(size, Sequence) and not isinstance(size, str) else (size,)
+    return as_known_size(sides * 2 if len(sides) == 1 else sides, owner, "size")

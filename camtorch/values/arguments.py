@@ -172,11 +172,11 @@ def as_image_size(value: Any, owner: str, name: str = "image_size") -> tuple[int
     return height, width
 
 
-def as_known_size(value: Any, owner: str) -> tuple[int, int]:
+def as_known_size(value: Any, owner: str, name: str = "image_size") -> tuple[int, int]:
     """Return (height, width) as two positive ints; raise an error for None."""
-    size = as_image_size(value, owner)
+    size = as_image_size(value, owner, name)
     if size is None:
-        raise TypeError(f"{owner}: image_size must be two integers (height, width); got None")
+        raise TypeError(f"{owner}: {name} must be two integers (height, width); got None")
     return size
 
 

@@ -196,8 +196,8 @@ WRONG = [
     (lambda: ct.head_rotation([0.0, 1.0]), ValueError, r"head_rotation: angles must be \(..., 3\), pitch, yaw"),
     (lambda: ct.head_rotation([-30.0, 20.0, 5.0]), ValueError, "must be radians; got 30, which seems"),
     # what people try first of edits, losses and shutters
-    (lambda: A.Resize([]), TypeError, "size must be whole numbers"),
-    (lambda: A.Rotate90(90), ValueError, "quarter turns; got 90. Divide degrees by 90"),
+    (lambda: A.Resize([]), TypeError, r"size must be two integers \(height, width\)"),
+    (lambda: A.Rotate90(90), ValueError, "quarter turns, one number or .*; got 90"),
     (lambda: A.RandomResizedCrop(32, scale=0.5), TypeError, "scale must be a range"),
     (lambda: ct.vignetting(MIXED, torch.ones(3)), ValueError, "one for each of 2 cameras"),
     (lambda: REPROJECTION(LENS, UV, torch.rand(9, 3)), ValueError, r"of target and .* must broadcast; got \(17, 2\)"),

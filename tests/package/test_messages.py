@@ -163,8 +163,7 @@ WRONG = [
     (lambda: arrays.Transform(MOUNT, np.eye(3)), TypeError, r"numpy.Transform: camera must be a Camera; got ndarray"),
     (lambda: augment.RandomMount(fov=(20, 30), camera=CAMERA).draw("2"), TypeError, r".* got '2'|fov"),
     (lambda: augment.RandomMount().draw(2, 7), TypeError, r"generator must be a torch.Generator, or None; got 7"),
-    (lambda: augment.Rotate90((0, 1, 2)), ValueError, r"Rotate90: times must be one number or \(least, most\)"),
-    (lambda: augment.Rotate90((3, 1)), ValueError, r"Rotate90: times must be \(least, most\), and step positive"),
+    (lambda: augment.Rotate90((3, 1)), ValueError, r"Rotate90: times must be quarter turns, one number or \(least, m"),
     (lambda: augment.FaceNormalizer(axis=3), TypeError, r"FaceNormalizer: axis must be a pixel \(u, v\); got 3"),
     (lambda: augment.collate([]), ValueError, r"collate: samples must not be empty"),
     # networks, data, calibration
