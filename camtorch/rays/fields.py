@@ -44,16 +44,9 @@ def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) 
     if step < 1:
         raise ValueError(f"{owner}: stride must be at least 1; got {step}")
     if any(side % step for side in size):
-        height, width = size
-        fewer, more = ([(side + extra) // step * step for side in size] for extra in (0, step - 1))
-        pad = f".pad(0, {more[1] - width}, 0, {more[0] - height}) if it is padded at the right and at the bottom"
-        ways = f".resize({more[0]}, {more[1]}), or {pad}"
-        if all(fewer):
-            crop = f".crop(0, 0, {fewer[0]}, {fewer[1]}) if a convolution drops the rest"
-            ways = f"{crop}, {pad}, or .resize({fewer[0]}, {fewer[1]})"
         raise ValueError(
             f"{owner}: stride must divide both sides of the image, {size} (height, width); got {step}. Edit the camera "
-            f"as the image is edited first: {ways}"
+            "as the image is: .crop if a convolution drops the rest, .pad if the image is padded, or .resize"
         )
     middle = (step - 1) / 2
     rows, columns = (torch.arange(side // step, dtype=like.dtype, device=like.device) * step + middle for side in size)

@@ -76,12 +76,12 @@ class PlaneWarp(ProxyWarp):
             return
         rotation, shift, normal, distance = known
         place = -(rotation.mT @ shift[..., None])[..., 0]
-        of_source = distance - (normal * place).sum(-1)
-        if not bool(torch.isfinite(normal).all() & (torch.linalg.vector_norm(normal, dim=-1) > 0).all()):
-            raise ValueError(f"{owner}: normal must be finite and not zero; got {self.normal.tolist()}")
-        if not bool((torch.isfinite(distance) & (distance != 0)).all()):
-            raise ValueError(f"{owner}: distance must be finite and not 0, at the target; got {self.distance.tolist()}")
-        if not bool((of_source * distance > 0).all()):
+        if not bool((torch.linalg.vector_norm(normal, dim=-1) > 0).all() & (distance != 0).all()):
+            raise ValueError(
+                f"{owner}: normal must not be zero, nor distance, at the target; got {self.normal.tolist()} and "
+                f"{self.distance.tolist()}"
+            )
+        if not bool(((distance - (normal * place).sum(-1)) * distance > 0).all()):
             raise ValueError(
                 f"{owner}: source and target must be on the same side of the plane; got the source at {place.tolist()} "
                 "in the target's frame. Check that the extrinsics are source from target"
@@ -190,10 +190,9 @@ class BirdsEye(PlaneWarp):
 
 def _as_ends(ends: tuple[float, float], name: str) -> tuple[float, float]:
     try:
-        low, high = ends
-    except (TypeError, ValueError, RuntimeError):
-        raise TypeError(f"BirdsEye: {name} must be (from, to) on the ground; got {shown(ends)}") from None
-    low, high = as_number(low, name, "BirdsEye"), as_number(high, name, "BirdsEye")
+        low, high = map(float, ends)
+    except (TypeError, ValueError):
+        low = high = math.nan
     if not -math.inf < low < high < math.inf:
-        raise ValueError(f"BirdsEye: {name} must be (from, to), ascending; got {(low, high)}")
+        raise ValueError(f"BirdsEye: {name} must be (from, to), ascending; got {shown(ends)}")
     return low, high
