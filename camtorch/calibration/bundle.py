@@ -147,7 +147,6 @@ def adjust(
     steps: int = 60,
     damping: float = FIRST_DAMPING,
     settled: float = SETTLED,
-    progress: Callable[[int, Tensor], None] | None = None,
 ) -> Adjusted:
     """Return the state of least squares near a given one, for each of B problems, whose cameras see the same views.
 
@@ -158,7 +157,7 @@ def adjust(
     counts = torch.stack([(s.weights > 0).sum((-1, -2)) for s in problem.observed]).sum(0)
     tolerance, tiny = settled / (2 * counts - problem.unknowns).clamp(min=1), _NOTHING**2 * counts
     flat = problem.flat(state)
-    found = minimise(problem, flat, tolerance=tolerance, tiny=tiny, steps=steps, damping=damping, progress=progress)
+    found = minimise(problem, flat, tolerance=tolerance, tiny=tiny, steps=steps, damping=damping)
     by_camera = problem.all_errors(found.state, torch.arange(len(found.cost), device=found.cost.device))
     return Adjusted(
         problem.state(found.state),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -84,19 +84,16 @@ def as_model(
             raise ValueError(f"{owner}: count must be that of the start, {start.distortion.shape[-1]}; got {count}")
         count = start.distortion.shape[-1]
     count = model.default_count if count is None else as_whole(count, "count", owner)
-    names = model.names_of(count) if 0 <= count <= max(_MANY, model.default_count) else None
-    if names is None:
-        limit = f", here {_MANY} at most" if count > _MANY else ""
-        raise ValueError(f"{owner}: count must fit {model.__name__}, {model.counts_text()}{limit}; got {count}")
+    if (names := model.names_of(count) if 0 <= count <= max(_MANY, model.default_count) else None) is None:
+        raise ValueError(f"{owner}: count must fit {model.__name__}, {model.counts_text()}; got {count}")
     names = (*INTRINSICS, *names)
     if not isinstance(fixed, Collection) or isinstance(fixed, Mapping):
         raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
     if start is not None and model.smoothness() is not None:
         fixed = (*fixed, *INTRINSICS)  # a surface can replace these
-    if unknown := [name for name in fixed if not isinstance(name, str) or name not in names]:
-        wrong = ", ".join(map(repr, unknown))
-        raise ValueError(f"{owner}: fixed must name parameters of {model.__name__}, {', '.join(names)}; got {wrong}")
+    if unknown := [name for name in fixed if name not in names]:
+        raise ValueError(f"{owner}: fixed must name parameters of {model.__name__}, {', '.join(names)}; got {unknown}")
     if start is not None:
         fixed = *fixed, *frozen_names(start)
     if start is None and {"fx", "fy"} & set(fixed):
@@ -104,20 +101,13 @@ def as_model(
     return Model(model, count, start, torch.tensor([name not in fixed for name in names], device="cpu"))
 
 
-def as_options(
-    loss: str | None, loss_scale: float, bend: bool, progress: Callable[[int, float], None] | None, owner: str
-) -> Callable[[int, Tensor], None] | None:
-    """Check the loss, the flag and the function, and return the progress callback for `adjust`."""
+def check_options(loss: str | None, loss_scale: float, bend: bool, owner: str) -> None:
+    """Raise if the loss, its scale or the flag is wrong."""
     if loss is not None and not (isinstance(loss, str) and loss in LOSSES):
         raise ValueError(f"{owner}: loss must be None or one of {LOSSES}; got {shown(loss)}")
     if not 0 < as_number(loss_scale, "loss_scale", owner) < math.inf:
         raise ValueError(f"{owner}: loss_scale must be positive pixels; got {loss_scale}")
     as_flag(bend, "bend", owner)
-    if progress is None:
-        return None
-    if not callable(progress):
-        raise TypeError(f"{owner}: progress must be a function of the step and the cost; got {progress!r}")
-    return lambda number, cost: progress(number, float(cost))
 
 
 @on_one_thread
@@ -134,7 +124,6 @@ def calibrate(
     loss: str | None = None,
     loss_scale: float = 1.0,
     bend: bool = False,
-    progress: Callable[[int, float], None] | None = None,
 ) -> Calibration:
     """Calibrate a camera of a model from known points and their pixels, without a focal length to start from.
 
@@ -152,7 +141,6 @@ def calibrate(
         loss: None for least squares; "huber" or "cauchy", of a residual's length, if some corners may be wrong.
         loss_scale: px, the length from which a robust loss grows slower.
         bend: Whether the board may be bent, which adds two unknowns, see `Calibration.bend`.
-        progress: Called after each step of the final search with its number and the cost.
 
     Raises:
         ValueError: If an argument is bad, or the views do not determine the camera, as a single view of a plane.
@@ -167,10 +155,10 @@ def calibrate(
     """
     owner = "calibrate"
     seen, layout = as_observations(object_points, image_points, image_size, owner)
-    on_progress = as_options(loss, loss_scale, bend, progress, owner)
+    check_options(loss, loss_scale, bend, owner)
     asked = as_model(model, count, start, fixed, owner)
     search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
-    (result,) = results([search], search.alone(bend, on_progress), search.free(bend)).cameras
+    (result,) = results([search], search.alone(bend), search.free(bend)).cameras
     if not result.converged:
         warn(f"{owner}: {result.failure} (rms {result.rms:.4g} px). Do not use the result; see its warnings")
     return result
@@ -228,12 +216,12 @@ class Search:
         """Return the unknowns of a search for this camera alone; `bend` adds the board's shape."""
         return Free((self.asked.free.to(self.given.pixels.device),), (False,), bend=bend)
 
-    def alone(self, bend: bool = False, progress: Callable[[int, Tensor], None] | None = None) -> Adjusted:
+    def alone(self, bend: bool = False) -> Adjusted:
         """Return the optimum for this camera's views; poses are searched again and kept if they fit it better."""
         asked, seen, size = self.asked, self.seen, self.layout.image_size
 
         def optimum(state: State) -> Adjusted:
-            return self.adjusted([self.observed], state, self.free(bend), steps=STEPS, progress=progress)
+            return self.adjusted([self.observed], state, self.free(bend), steps=STEPS)
 
         if asked.start is None and asked.kind.smoothness() is not None:
             raise ValueError(

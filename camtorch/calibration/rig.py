@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from camtorch.calibration.bundle import Bundle, CameraObservations, Free, Poses, State
-from camtorch.calibration.calibrate import STEPS, Search, as_model, as_options, middle_of, results
+from camtorch.calibration.calibrate import STEPS, Search, as_model, check_options, middle_of, results
 from camtorch.calibration.observations import Points, as_rig_observations
 from camtorch.calibration.uncertainty import shared_factor
 from camtorch.calibration.verdict import Calibration
@@ -50,21 +50,6 @@ class RigCalibration:
     def residuals(self) -> dict[str, Any]:
         """Projected minus observed pixels, by name of the camera, in the form of its image points; NaN if unseen."""
         return {name: camera.residuals for name, camera in self.cameras.items()}
-
-    @property
-    def inliers(self) -> dict[str, Any]:
-        """Inliers by name of the camera, as in `Calibration`."""
-        return {name: camera.inliers for name, camera in self.cameras.items()}
-
-    @property
-    def parameter_names(self) -> dict[str, tuple[str, ...]]:
-        """Names of parameters, by name of the camera."""
-        return {name: camera.parameter_names for name, camera in self.cameras.items()}
-
-    @property
-    def covariance(self) -> dict[str, Tensor]:
-        """Covariances (P, P) of the parameters, by name of the camera."""
-        return {name: camera.covariance for name, camera in self.cameras.items()}
 
     @property
     def std(self) -> dict[str, Tensor]:
@@ -107,7 +92,6 @@ def calibrate_rig(
     loss: str | None = None,
     loss_scale: float = 1.0,
     bend: bool = False,
-    progress: Callable[[int, float], None] | None = None,
 ) -> RigCalibration:
     """Calibrate cameras that see the same boards, and find their poses.
 
@@ -124,14 +108,13 @@ def calibrate_rig(
         loss: As in `calibrate`, like all other arguments.
         loss_scale: px.
         bend: Whether the board may be bent.
-        progress: Called after each step of the last search with its number and the cost.
 
     Raises:
         ValueError: If `calibrate` raises for an argument, names differ, or no board links a camera to the others.
     """
     owner = "calibrate_rig"
     by_name = as_rig_observations(object_points, image_points, image_sizes, models, owner)
-    on_progress = as_options(loss, loss_scale, bend, progress, owner)
+    check_options(loss, loss_scale, bend, owner)
     for given in (count, start, fixed):
         stray = [name for name in given if name not in by_name] if isinstance(given, Mapping) else []
         if stray:
@@ -146,7 +129,7 @@ def calibrate_rig(
     learns = tuple(parameters for search in searches for parameters in search.free().parameters)
     free = Free(learns, tuple(c > 0 for c in range(len(searches))), bend=bend)
     first = _join_starts(observed, [_calibrate_alone(search) for search in searches], free)
-    adjusted = searches[0].adjusted(observed, first, free, steps=STEPS, progress=on_progress)
+    adjusted = searches[0].adjusted(observed, first, free, steps=STEPS)
     found = results(searches, adjusted, free)
     cameras, state = dict(zip(by_name, found.cameras, strict=True)), found.adjusted.state
     rotations, translations = (t[0] for t in state.boards)

@@ -58,15 +58,11 @@ class Selection:
 
     def lines(self) -> list[str]:
         """Return a table, and the reason below it."""
-        rows = [("model", "coefficients", "rms fitted", "rms held out")]
+        lines = [f"  {'model':<14}  coefficients  rms fitted  rms held out"]
         for trial in self.trials:
-            values = (f"{trial.rms:.4f}", f"{trial.held_out:.4f}") if not trial.reason else ("-", "-")
-            rows.append((trial.model, str(trial.count), *values))
-        widths = [max(len(row[column]) for row in rows) for column in range(4)]
-        lines = [f"  {row[0]:<{widths[0]}}  " + "  ".join(f"{row[i]:>{widths[i]}}" for i in (1, 2, 3)) for row in rows]
-        for row, trial in enumerate(self.trials, 1):
-            lines[row] += "  taken" if trial is self.best else f"  failed: {trial.reason:.60}" if trial.reason else ""
-        return [line.rstrip() for line in lines] + [self.why]
+            note = "  taken" if trial is self.best else f"  failed: {trial.reason:.60}" if trial.reason else ""
+            lines.append(f"  {trial.model:<14}  {trial.count:>12}  {trial.rms:>10.4f}  {trial.held_out:>12.4f}{note}")
+        return [*lines, self.why]
 
 
 def select(
@@ -96,13 +92,13 @@ def select(
     def calibrated(rows: Array, model: str | Camera, **options: Any) -> Calibration:
         return calibrate(model, points[rows], pixels[rows], image_size=layout.image_size, **options)
 
-    weights = np.isfinite(pixels[..., 0]).sum(1)
-    tried, trials = list(candidates), []
+    weights, tried, trials = np.isfinite(pixels[..., 0]).sum(1), list(candidates), []
     for number, (model, count) in enumerate(tried, 1):
         names = [name for name in fixed if name in (*INTRINSICS, *(MODELS[model].names_of(count) or ()))]
         options = {"fixed": names, "loss": loss, "loss_scale": loss_scale}
+        numbers, errors = np.arange(len(weights)), np.full(len(weights), np.nan)
+        trial = Trial(model, count, math.nan, math.nan, errors)
         try:
-            numbers, errors = np.arange(len(weights)), np.full(len(weights), np.nan)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # the numbers of a trial show what is wrong
                 if not (whole := calibrated(numbers, model, count=count, **options)).converged:
@@ -115,9 +111,10 @@ def select(
             held_out = math.sqrt(float((weights * errors).sum() / weights.sum()))
             if not math.isfinite(held_out):
                 raise ValueError("held-out views have corners without a pixel")
-            trials.append(Trial(model, count, whole.rms, held_out, errors))
+            trial.rms, trial.held_out = whole.rms, held_out
         except ValueError as error:
-            trials.append(Trial(model, count, math.nan, math.nan, np.full(len(pixels), np.nan), str(error)))
+            trial.reason = str(error)
+        trials.append(trial)
         if progress is not None:
             progress(number / len(tried))
     if not (fitted := [trial for trial in trials if not trial.reason]):
@@ -131,9 +128,9 @@ def select(
 
     best = min(filter(as_good, fitted), key=lambda trial: trial.count)  # the first of as many, which is better known
     named = f"{best.model} with {best.count} coefficients" if best.count else best.model
-    off = f"{best.held_out:.4g} px on views that it was not fitted to"
-    if best is least:
-        return Selection(trials, best, f"{named}: {off}, the smallest error")
-    share = 100 * (1 - least.held_out / best.held_out)
-    why = f"{named}: {off}; {least.model} with {least.count} has {share:.1f} % less, which is no more than chance"
+    why = "the smallest error"
+    if best is not least:
+        share = f"{100 * (1 - least.held_out / best.held_out):.1f} %"
+        why = f"{least.model} with {least.count} has {share} less, which is no more than chance"
+    why = f"{named}: {best.held_out:.4g} px on views that it was not fitted to; {why}"
     return Selection(trials, best, why)

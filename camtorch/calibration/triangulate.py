@@ -14,7 +14,7 @@ from camtorch.calibration.bundle import Bundle, CameraObservations, Free, Poses,
 from camtorch.cameras.camera import Camera
 from camtorch.least_squares.levenberg_marquardt import minimise
 from camtorch.poses.extrinsics import Extrinsics
-from camtorch.values.arguments import Numbers, check_devices, hinting, working_dtype
+from camtorch.values.arguments import Numbers, check_devices, hinting, shown, working_dtype
 from camtorch.values.module import BatchedModule
 from camtorch.values.threads import on_one_thread
 
@@ -79,13 +79,11 @@ def triangulate(
         raise ValueError(f"triangulate: pixels must be (C, *N, 2); got shape {tuple(seen_at.shape)}")
     count, *shape = seen_at.shape[:-1]
     given, poses = _as_list(cameras, "cameras", Camera, count), _as_list(extrinsics, "extrinsics", Extrinsics, count)
-    if not len(given) == len(poses) == count:
+    if count < 2 or not len(given) == len(poses) == count:
         raise ValueError(
-            "triangulate: cameras and extrinsics must be as many as rows of pixels (C, *N, 2); got "
+            "triangulate: cameras, extrinsics and rows of pixels (C, *N, 2) must be of the same C >= 2 cameras; got "
             f"{len(given)} cameras, {len(poses)} extrinsics and pixels {tuple(seen_at.shape)}"
         )
-    if count < 2:
-        raise ValueError(f"triangulate: cameras must be at least two; got {count}")
     check_devices("triangulate", pixels=seen_at, **{f"extrinsics[{i}]": p.rotation for i, p in enumerate(poses)})
     dtype = working_dtype(seen_at, *(t for camera in given for t in camera._tensors), *(p.rotation for p in poses))
     rows = [rows_of(camera, torch.Size()) for camera in given]
@@ -104,16 +102,11 @@ def triangulate(
 def _as_list(modules: Sequence[M] | M, name: str, kind: type[M], count: int) -> list[M]:
     """Return modules without batch dims, from a list, a batch, or one for all."""
     if isinstance(modules, kind):
-        listed = [modules[i] for i in range(len(modules))] if modules.batch_shape else [modules] * count
-    else:
-        listed = list(cast(Sequence[M], modules)) if hasattr(modules, "__iter__") else [cast(M, modules)]
-    for module in listed:
-        if not isinstance(module, kind):
-            raise TypeError(f"triangulate: {name} must be {kind.__name__} in a list; got a {type(module).__name__}")
-        if module.batch_shape:
-            own = tuple(module.batch_shape)
-            raise ValueError(f"triangulate: {name} must have no batch dims of their own; got one with {own}")
-    return listed
+        return [modules[i] for i in range(len(modules))] if modules.batch_shape else [modules] * count
+    for module in cast(Sequence[M], modules):
+        if not isinstance(module, kind) or module.batch_shape:
+            raise TypeError(f"triangulate: {name} must be single {kind.__name__} in a list; got {shown(module)}")
+    return list(cast(Sequence[M], modules))
 
 
 class _Task(NamedTuple):
@@ -151,13 +144,14 @@ def _solve(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
         nearest = torch.where(torch.isfinite(nearest), nearest, 0.0)
         squares = (nearest - positions[:, None]).square().sum(-1)
         weights = seen / torch.where(squares > 0, squares, 1.0)
-    start, count = nearest, len(views)
+    count = len(views)
     if count == 0:
-        return start, views.bool()
+        return nearest, views.bool()
     middle = (seen[..., None] * positions[:, None]).sum(0) / views.clamp(min=1)[:, None]
     ahead = normalize((seen[..., None] * rays).sum(0), dim=-1)
     extent = (positions - positions.mean(0)).norm(dim=-1).amax()
-    start = torch.where(_is_ahead(start, positions, rays, task.seen)[:, None], start, middle + _FAR * extent * ahead)
+    fits = _is_ahead(nearest, positions, rays, task.seen)[:, None]
+    start = torch.where(fits, nearest, middle + _FAR * extent * ahead)
 
     # a point is the position of a board with one corner, in the frame of the first camera
     first, shift = rotations[0], translations[0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -62,7 +61,6 @@ def minimise(
     going: Tensor | None = None,
     steps: int = 60,
     damping: float = FIRST_DAMPING,
-    progress: Callable[[int, Tensor], None] | None = None,
 ) -> Minimum:
     """Return the states of least cost near the given ones; no problem depends on another.
 
@@ -70,7 +68,7 @@ def minimise(
 
     For B problems: a search ends if the predicted decrease is below the part `tolerance` (B,) of the cost, or the cost
     is at most `tiny` (B,). `going` (B,) bool selects the problems to search, all by default. `steps` limits all steps,
-    rejected ones included; `damping` is the first one; `progress` gets the number of each step and the costs.
+    rejected ones included; `damping` is the first one.
     """
     device = state[0].device
     every = torch.arange(len(state[0]), device=device)
@@ -81,7 +79,7 @@ def minimise(
     weights, growth, converged = np.full_like(cost, damping), np.full_like(cost, 4.0), cost <= least
     is_going = np.isfinite(cost) & ~converged & (True if going is None else going.numpy(force=True))
     system = None
-    for number in range(steps):
+    for _ in range(steps):
         if system is None:
             (rows,) = is_going.nonzero()
             if len(rows) == 0:
@@ -116,8 +114,6 @@ def minimise(
             settled = settled | stuck & (system.firm_decrement.numpy(force=True) <= enough)
         converged[rows] = settled
         is_going[rows] = ~(settled | stuck)
-        if progress is not None:
-            progress(number + 1, torch.from_numpy(cost.copy()))
         if better.any() or stuck.any():
             system = None
     return Minimum(state, *(torch.from_numpy(t).to(device) for t in (cost, converged)))

@@ -255,7 +255,7 @@ def test_corners_without_noise_have_an_optimum(key, form):
     ("changes", "error", "words"),
     [
         ({"count": 3}, ValueError, "got 3"),
-        ({"model": "kannala_brandt", "count": 10**9}, ValueError, "here 100 at most; got 1000000000"),
+        ({"model": "kannala_brandt", "count": 10**9}, ValueError, "got 1000000000"),
         ({"fixed": ("k9",)}, ValueError, "k9"),
         ({"fixed": ("fx",)}, ValueError, "start"),
         ({"fixed": None}, TypeError, "fixed must be names"),
@@ -264,7 +264,6 @@ def test_corners_without_noise_have_an_optimum(key, form):
         ({"loss": "huber", "loss_scale": 0.0}, ValueError, "loss_scale"),
         ({"loss": "huber", "loss_scale": "1"}, TypeError, "loss_scale must be a number"),
         ({"bend": "no"}, TypeError, "bend must be True or False"),
-        ({"progress": "bar"}, TypeError, "progress must be a function"),
         ({"start": ct.KannalaBrandt([500.0, 500.0, 320.0, 240.0])}, ValueError, "start must be one BrownConrady.*Kan"),
         ({"start": "camera.yml"}, TypeError, "start must be a camera; got str; ct.load"),
         ({"model": ct.Pinhole(torch.ones(2, 4))}, ValueError, r"start must be one Pinhole.*batch_shape=\(2,\)"),
