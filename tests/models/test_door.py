@@ -89,9 +89,8 @@ WRONG = [
     ),
     (lambda: BARE.width, ValueError, r"^Pinhole: image_size must be .* for width"),
     (lambda: BARE.fov, ValueError, "image"),
-    (lambda: CAMERA.rays(stride=14), ValueError, r"got 14\. .* \.crop\(0, 0, 476, 630\) .* \.pad\(0, 4, 0, 10\)"),
+    (lambda: CAMERA.rays(stride=14), ValueError, r"got 14\. .* \.crop if .*, \.pad"),
     (lambda: CAMERA.rays(0), ValueError, "at least 1"),
-    (lambda: CAMERA.resize(48, 64).rays(64), ValueError, r"divide both .* \(48, 64\).*: .resize\(64, 64\), or"),
     # other numbers of models
     (lambda: GENERAL(INTRINSICS, [0.0, 0.1]), ValueError, r"^KannalaBrandt.*coefficient.*0\.0"),
     (lambda: GENERAL(INTRINSICS, [1.0, NAN]), ValueError, "^KannalaBrandt.*coefficients.*nan"),
