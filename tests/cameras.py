@@ -6,6 +6,7 @@ helps to try it hard is its entry in RANGES. A model that has neither is tried w
 
 import json
 import math
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,15 @@ KEYS = sorted(ct.MODELS)
 DISTINCT = {"pinhole", "kannala_brandt", "fisheye624", "cylindrical", "double_sphere", "division", "f_theta_backward"}
 # Those, what most people have, and those with a part of their own
 USUAL = DISTINCT | {"brown_conrady", "fisheye62", "fov", "equisolid", "tabulated"}
+
+
+@contextmanager
+def default_dtype_of_double():
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 def slow_unless(quick, cases):

@@ -13,14 +13,14 @@ from typing_extensions import Unpack
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds, check_sizes
 from camtorch.augment.elsewhere import Elsewhere, remember_camera, twin_of
 from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.kinds import Named
+from camtorch.augment.kinds import FRONT_ENDS, Named
 from camtorch.augment.ranges import Range, Spans, draw, draw_shares
 from camtorch.augment.sample import Batch, Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.door import may_look
 from camtorch.evaluate.known import are_known, are_numbers, known_false, known_true
-from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_part, as_whole, warn
+from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_part, as_whole, hinting, warn
 from camtorch.values.module import typed_as
 from camtorch.warp.warp import Warp
 
@@ -126,6 +126,7 @@ class Augmentation(SampleTransform):
     same_on_batch: bool
     min_filled: float | None
     _last: Change | Callable[[], Change] | None = None
+    _is_first: bool = False  # whether the last sample came without a rotation
 
     def __init__(
         self,
@@ -375,6 +376,7 @@ class Augmentation(SampleTransform):
             )
 
     @on_samples
+    @hinting(FRONT_ENDS)
     def forward(
         self,
         sample: Mapping[str, Any] | None = None,
@@ -445,6 +447,7 @@ class Augmentation(SampleTransform):
         if change.count != count:
             raise ValueError(f"{self._name}: draw must be for {count} samples; got one for {change.count}")
         if not torch.compiler.is_compiling():
+            self.__dict__["_is_first"] = "rotation" not in named
             self.__dict__["_last"] = change  # as nn.Module would, after some questions
             if count and not self._warned and "image" in [found for found, _ in named.values()]:
                 self.tell_of_empty_images(change.host.source if isinstance(change, Elsewhere) else camera)
@@ -482,9 +485,10 @@ class Augmentation(SampleTransform):
                 f"{self._name}: inverse must have a change to invert; got none. Call it first, or give draw= and "
                 "camera="
             )
-        if "camera" in sample and not change.leads_to(sample["camera"]):
+        turned = sample.get("rotation") if draw is None and self._is_first else None
+        if "camera" in sample and not change.leads_to(sample["camera"], turned):
             raise ValueError(
-                f"{self._name}: the sample's camera must be the one that this change made; got "
+                f"{self._name}: camera and rotation of the sample must be those that this change made; got "
                 f"{sample['camera']!r:.60}. If the sample is of another call, pass its draw= and the camera= before it"
             )
         return self.moved_by(change.inverse(), sample, predicted=True)

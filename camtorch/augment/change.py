@@ -27,6 +27,7 @@ from camtorch.warp.sampling import Mode, Options
 from camtorch.warp.shifted import ShiftedWarp
 from camtorch.warp.warp import Warp
 
+_HALF = 5e-3  # absolute: rotations that were half precision on the way are the same ones
 _ROUNDED = 1e-5  # relative: cameras that were float32 on the way are the same ones
 Moved = TypeVar("Moved", Tensor, tuple[Tensor, Tensor])
 
@@ -240,11 +241,14 @@ class Change:
             return self.rotation[0].clone()
         return (no_turn(view.distortion.dtype) if view.rotation is None else view.rotation).clone()
 
-    def leads_to(self, camera: Camera | Sequence[Camera]) -> bool:
-        """Whether these may be the cameras after: of their number and intrinsics, where one may look."""
-        ours, theirs = (one.intrinsics.detach().reshape(-1, 4) for one in (self.target, as_one(camera)))
-        return ours.shape == theirs.shape and not known_false(
-            torch.isclose(ours.double(), theirs.to(ours.device).double(), _ROUNDED)
+    def leads_to(self, camera: Camera | Sequence[Camera], rotation: Tensor | None = None) -> bool:
+        """Whether these may be the cameras after, by number, intrinsics and rotation, where one may look."""
+        pairs = [(self.target.intrinsics.reshape(-1, 4), as_one(camera).intrinsics.reshape(-1, 4))]
+        pairs += [] if rotation is None else [(self.rotation, rotation.reshape(-1, 3, 3))]
+        return all(
+            ours.shape == its.shape
+            and not known_false(torch.isclose(ours.double(), its.to(ours.device).double(), _ROUNDED, _HALF))
+            for ours, its in pairs
         )
 
     def _cameras(self, cameras: list[Camera]) -> Camera:

@@ -279,6 +279,7 @@ class CameraDrawer(Augmentation):
             moved = None if one is None else ready.call(start.before, one.native, one.rotation, fields)
             if one is not None and moved is not None and None not in moved:
                 base = camera if like is None else start.base
+                self.__dict__["_is_first"] = ready.turns
                 self.__dict__["_last"] = partial(_change_of, start, one, base, {**options}, camera)
                 return self._sample_after(sample, ready, start, one, base, moved), None
         return None, {"apply": [applied], **spans.named(numbers)}

@@ -21,6 +21,7 @@ from camtorch.evaluate.private import pytree
 from camtorch.poses.rotations import are_rotations, check_rotation, is_right, rotation_matrix, rotation_vector
 from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians, warn
 from camtorch.values.threads import thread_count
+from camtorch.warp import arrays
 from camtorch.warp.plan import Label, SampleCall, call_for
 from camtorch.warp.sampling import Options, Sampler
 
@@ -28,6 +29,11 @@ Named = dict[str, tuple[str, Any]]
 """Maps a name to (kind, tensor or list of tensors)."""
 
 
+FRONT_ENDS = (
+    "For PIL images and torchvision write camtorch.augment.torchvision.Transform(augmentation); others are "
+    "camtorch.augment.albumentations.Transform, numpy.Transform and kornia.CameraAugmentation"
+)
+"""The hint of errors about what other libraries pass."""
 KEEP = "keep"
 IMAGES = ("image", "mask", "depth", "distance")
 
@@ -102,7 +108,7 @@ def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tup
 _DIRECTIONS = Field(
     1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", lambda change, rays, _: change.rays(rays)
 )
-_POSE = Field(2, 2, (4,), "(B, 4, 4) or (B, 3, 4), camera from head", _pose)
+_POSE = Field(2, 2, (4,), "(B, 4, 4) or (B, 3, 4), camera from head", _pose, True)
 _MASKS = "(B, C, H, W) or (B, H, W)"
 _DEPTHS = "(B, 1, H, W) or (B, H, W), along"
 _PITCH_YAW = "(B, *N, 2) pitch and yaw of a gaze in radians"
@@ -121,9 +127,11 @@ KINDS = {
     "pitch_yaw": Field(1, _MANY, (2,), _PITCH_YAW, lambda c, angles, _: c.rays(angles, from_pitch_yaw, to_pitch_yaw)),
     "head_pose": _POSE,
     "pose": _POSE,
-    "rvec": Field(1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector),
-    "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions),
-    "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns)),
+    "rvec": Field(1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector, True),
+    "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions, True),
+    "rotation": Field(
+        2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns), True
+    ),
 }
 _TURNED = "points", "gaze", "directions", "tvec", "landmarks"
 _MATRICES = "head_pose", "pose", "rotation"
@@ -233,15 +241,15 @@ def moves(kind: str, value: Tensor) -> Move:
 def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
     """Return the value of a field as a tensor of real numbers."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
-        value = torch.from_numpy(value)
+        value = arrays.as_tensor(value, name, owner)
     if not isinstance(value, Tensor) or value.dtype.is_complex:
         what = f"dtype {value.dtype}" if isinstance(value, (Tensor, np.ndarray)) else type(value).__name__
-        plain = isinstance(value, (list, tuple, int, float))
-        hint = ". Plain numbers go in as torch.tensor(numbers); a list has a tensor for each sample"
-        raise TypeError(
-            f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}"
-            f"{hint if plain else _hint(name)}"
-        )
+        hint = _hint(name)
+        if isinstance(value, (list, tuple, int, float)):
+            hint = ". Plain numbers go in as torch.tensor(numbers); a list has a tensor for each sample"
+        elif kind == "image" and hasattr(value, "mode"):
+            hint = f". {FRONT_ENDS}"
+        raise TypeError(f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}{hint}")
     if kind not in IMAGES and not value.dtype.is_floating_point:
         value = value.to(torch.get_default_dtype())  # whole pixels do not stay whole
     return value
@@ -261,8 +269,15 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
         hint = _hint(name)
         if kind in ("gaze", "directions") and value.ndim and value.shape[-1] == 2:
             hint = f". Pitch and yaw in radians go in as pitch_yaw, or with fields={{{name!r}: 'pitch_yaw'}}"
-        if kind in ("rvec", "tvec") and value.shape[-2:] == (3, 1):
+        if 3 in field.last and value.shape[-2:] == (3, 1):
             hint = f". OpenCV's column goes in as {name}[..., 0]"
+        if kind in ("head_pose", "pose") and value.shape[-1:] == (3,):
+            hint = (
+                ". Rotations R (..., 3, 3) go in as torch.nn.functional.pad(R, (0, 1)), with zeros for the place; "
+                "R = ct.head_rotation(angles), of pitch, yaw and roll in radians"
+            )
+        if kind in ("boxes", "keypoints", "landmarks") and dims == 1:
+            hint = f". A single one for each sample goes in as {name}[..., None, :]"
         if kind == "image" and value.ndim == 5:
             hint = f". The frames of clips go in as a batch, by {name}.flatten(0, 1)"
         if kind == "keypoints" and value.ndim and value.shape[-1] == 3:
@@ -328,7 +343,7 @@ def warn_of_numbers(kind: str, name: str, value: Tensor, has_flags: bool, owner:
 
 
 def is_batch(named: Named, camera: object) -> bool:
-    """Whether `named` is a batch, by its first image, pixels or boxes, else by cameras, else any field."""
+    """Whether `named` is a batch, by its first image, pixels, boxes or pose, else by cameras, else any field."""
     if isinstance(camera, (list, tuple)):
         return True
     for kind, value in sorted(named.values(), key=lambda pair: _RANKS[pair[0]]):

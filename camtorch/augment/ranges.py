@@ -156,6 +156,6 @@ def draw_shares(
     if spans is None or spans.rows != rows or spans.ranges != ranges:
         spans = Spans(ranges, rows)
     device = _CPU if generator is None else generator.device
-    gate = torch.rand(rows, generator=generator, device=device) < p if 0 < p < 1 else None
+    gate = torch.rand(rows, generator=generator, dtype=torch.float32, device=device) < p if 0 < p < 1 else None
     # in float64, so that what is drawn is what every precision sees
     return gate, torch.rand(spans.total, generator=generator, dtype=torch.float64, device=device), spans

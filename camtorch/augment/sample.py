@@ -23,6 +23,7 @@ from camtorch.augment.clips import Clips
 from camtorch.augment.elsewhere import remember_camera
 from camtorch.augment.kinds import (
     CHECKED,
+    FRONT_ENDS,
     IMAGES,
     KEEP,
     KINDS,
@@ -46,6 +47,7 @@ from camtorch.evaluate.known import are_free, in_worker, is_unknown
 from camtorch.evaluate.private import pytree
 from camtorch.models import Pinhole
 from camtorch.values.arguments import (
+    CLOSE,
     GUESS_CAMERA,
     LEFT,
     as_flag,
@@ -58,6 +60,7 @@ from camtorch.values.arguments import (
 from camtorch.values.module import GeometryModule
 from camtorch.values.threads import on_one_thread
 from camtorch.warp.sampling import Options, as_options
+from camtorch.warp.warp import as_sized
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -220,7 +223,7 @@ class SampleTransform(KeepsCamera, nn.Module):
     def _meant(cls, word: str) -> str:
         """Return the keyword that somebody may have meant, and all that are known."""
         known = [*_keywords(cls)]  # type: ignore[arg-type]  # a class can be hashed
-        close = difflib.get_close_matches(word, [*known, *cls.other_words], 1)
+        close = difflib.get_close_matches(word, [*known, *cls.other_words], 1, CLOSE)
         meant = f"did you mean {cls.other_words.get(close[0], close[0])!r}? Known" if close else "known"
         kin = (one for base in cls.__mro__[1:-2] for one in (base, *base.__subclasses__()))
         has = next((one.__name__ for one in kin if word in _keywords(one)), None)
@@ -260,7 +263,8 @@ class SampleTransform(KeepsCamera, nn.Module):
         """Return the sample and the keyword arguments as one dict."""
         if not (sample is None or hasattr(sample, "keys")):
             got = type(sample).__name__
-            raise TypeError(f"{self._name}: a sample must be a dict of fields, or keywords, as in image=...; got {got}")
+            must = "a sample must be a dict of fields, or keywords, as in image=..."
+            raise TypeError(f"{self._name}: {must}; got {got}. {FRONT_ENDS}")
         return sample if isinstance(sample, Single) and not fields else {**({} if sample is None else sample), **fields}
 
     def _clips(self, sample: Sample, kinds: Mapping[str, str] | None = None) -> Clips | None:
@@ -396,11 +400,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             raise ValueError(f"{self._name}: camera must have one for each of {count} samples; got {len(cameras)}")
         for i, one in enumerate(cameras):
             name = f"camera[{i}]" if several else "camera"
-            if not isinstance(one, Camera):
-                raise TypeError(f"{self._name}: {name} must be a Camera; got {no_camera(one)}")
-            if one.image_size is None:
-                raise ValueError(f"{self._name}: {name} must have an image_size=(height, width); got None")
-            shape = tuple(one.batch_shape)
+            shape = tuple(as_sized(one, name, self._name).batch_shape)
             if shape not in ((), (1,), (count,)) or (shape and len(cameras) > 1):
                 raise ValueError(
                     f"{self._name}: {name} must have no batch dims, or those of {count} samples; got {shape}"

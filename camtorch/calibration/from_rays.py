@@ -15,7 +15,7 @@ from camtorch.convert import fitting, views
 from camtorch.convert.result import Conversion
 from camtorch.models import UCM
 from camtorch.rays.lattices import angles_from_axis
-from camtorch.values.arguments import Numbers, as_image_size, as_values
+from camtorch.values.arguments import Numbers, as_image_size, as_values, hinting
 from camtorch.values.threads import on_one_thread
 
 _ALPHAS = (0.0, 0.35, 0.5, 0.6, 0.65, 0.75)
@@ -26,6 +26,7 @@ _LEAST = 4  # rays
 
 @on_one_thread
 @torch.no_grad()
+@hinting("It takes fit(model, pixels, rays, image_size=(height, width))")
 def fit(
     model: type[Camera] | str | Camera,
     pixels: Numbers,

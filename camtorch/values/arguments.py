@@ -31,7 +31,7 @@ Taken = ParamSpec("Taken")
 Result = TypeVar("Result")
 Name = TypeVar("Name", bound=str)
 
-_CLOSE = 0.5  # as difflib has it: size and image_size are
+CLOSE = 0.5  # as difflib has it: size and image_size are
 
 
 def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Result]]:
@@ -45,9 +45,10 @@ def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Re
             except TypeError as error:
                 is_inner = error.__traceback__ is None or error.__traceback__.tb_next is not None
                 if name := next((name for name in kwargs if f"unexpected keyword argument {name!r}" in str(error)), ""):
-                    close = difflib.get_close_matches(name, inspect.signature(function).parameters, 1, _CLOSE)
+                    close = difflib.get_close_matches(name, inspect.signature(function).parameters, 1, CLOSE)
                     meant = f"Did you mean {close[0]!r}? " if close else ""
-                    raise TypeError(f"{error}. {meant}{hint}. {LEFT}") from None
+                    unknown = f"{function.__qualname__}() got an unexpected keyword argument {name!r}"
+                    raise TypeError(f"{unknown}. {meant}{hint}. {LEFT}") from None
                 if is_inner:
                     raise
                 raise TypeError(f"{error}. {hint}") from None
@@ -92,7 +93,7 @@ def as_real(value: Numbers, name: str, owner: str, device: torch.device | None =
                 value = torch.as_tensor(_as_plain(value), device=device)
         except (TypeError, ValueError, RuntimeError) as error:
             raise TypeError(
-                f"{owner}: {name} must be numbers (a tensor, an array or a list); got {type(value).__name__}: {error}"
+                f"{owner}: {name} must be numbers (a tensor, an array or a list); got {no_camera(value)}: {error}"
             ) from None
     _check_real(value, name, owner, device)
     if not value.dtype.is_floating_point:
@@ -127,6 +128,8 @@ def _check_real(value: Tensor, name: str, owner: str, device: torch.device | Non
 
 def _as_plain(value: Numbers) -> Numbers:
     """Return `value` as torch accepts it: a copy of an array that is reversed, read-only or of another byte order."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise TypeError(MASKED)
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
         if value.dtype.kind == "f" and value.dtype.itemsize > 8:
             return value.astype(np.float64)
@@ -187,6 +190,9 @@ def shown(value: object) -> str:
     return f"{value!r:.60}"
 
 
+MASKED = "its mask would be lost. Pass array.filled(value), and ~array.mask apart"
+"""The reason of errors about masked arrays."""
+
 GUESS_CAMERA = "KannalaBrandt.from_fov(degrees, image_size=...) guesses a camera"
 """The hint of errors about a missing camera."""
 
@@ -195,6 +201,8 @@ def no_camera(value: object) -> str:
     """Return the type of what was passed instead of a camera, and how a rig, a file or a matrix leads to one."""
     if hasattr(type(value), "_way_to_cameras"):  # a Rig, whose module imports this one
         return f"{type(value).__name__}, {value._way_to_cameras()}"  # type: ignore[attr-defined]
+    if type(value).__module__.startswith("kornia."):
+        return f"{type(value).__name__}; ct.from_kornia(theirs) makes a camera and a pose of it"
     if isinstance(value, os.PathLike) or (isinstance(value, str) and os.path.splitext(value)[1]):
         return f"{type(value).__name__}; ct.load({os.fspath(value)!r:.60}).camera loads the camera of a file"
     if tuple(getattr(value, "shape", ()))[-2:] == (3, 3):

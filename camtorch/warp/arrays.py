@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from camtorch.values.arguments import MASKED
+
 Array: TypeAlias = "np.ndarray[Any, Any]"
 
 
@@ -29,6 +31,8 @@ _FEW = 4  # channels
 
 def as_tensor(array: object, name: str, owner: str) -> Tensor:
     """Return an `array` of real numbers as a tensor to read only, without a copy if torch can read its memory."""
+    if isinstance(array, np.ma.MaskedArray):
+        raise TypeError(f"{owner}: {name} must be an array without a mask; got a MaskedArray: {MASKED}")
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
         what = f"dtype {array.dtype}" if isinstance(array, np.ndarray) else type(array).__name__
         hint = f". np.array({name}) makes one" if hasattr(array, "__array_interface__") else ""

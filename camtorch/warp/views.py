@@ -14,7 +14,17 @@ from camtorch.cameras.camera import Camera
 from camtorch.models import Pinhole
 from camtorch.poses.rotations import mount_rotation
 from camtorch.rays.lattices import slopes_at_axis
-from camtorch.values.arguments import Numbers, as_fov, as_known_size, as_number, as_values, as_whole, check_boxes, shown
+from camtorch.values.arguments import (
+    Numbers,
+    as_fov,
+    as_known_size,
+    as_number,
+    as_values,
+    as_whole,
+    check_boxes,
+    hinting,
+    shown,
+)
 from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import GeometryModule, remade, typed_as
 from camtorch.warp.boxes import corners_of
@@ -107,6 +117,7 @@ class Views(GeometryModule):
         return ", ".join(self.names)
 
 
+@hinting("It takes cube(camera, size), with size the sides of a face in pixels")
 def cube(camera: Camera, size: int | None = None) -> Views:
     """Return the six faces of a cube around a camera, of 90 degrees each: front, right, back, left, up, down.
 
@@ -116,6 +127,7 @@ def cube(camera: Camera, size: int | None = None) -> Views:
     return _views(camera, size, math.pi / 2, yaws, pitches, FACES, "cube")
 
 
+@hinting("It takes ring(camera, count, size=...), with size the sides of a view in pixels")
 def ring(camera: Camera, count: int, *, fov: float | None = None, size: int | None = None) -> Views:
     """Return `count` views side by side, from left to right, over a camera's field of view.
 
@@ -150,6 +162,7 @@ def _views(
     return Views(camera, pinhole(intrinsics, (size, size)), rotations, names)
 
 
+@hinting("It takes look_at(camera, boxes, image_size=(height, width)), and perhaps margin")
 def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin: float = 0.25) -> Warp:
     """Return a warp to a pinhole camera that looks at a box, such as a detected face: a crop without perspective.
 

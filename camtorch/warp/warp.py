@@ -37,7 +37,8 @@ def as_sized(camera: Camera, name: str, owner: str) -> Camera:
     if not isinstance(camera, Camera):
         raise TypeError(f"{owner}: {name} must be a Camera; got {no_camera(camera)}")
     if camera.image_size is None:
-        raise ValueError(f"{owner}: {name} must have an image_size=(height, width); got None")
+        how = "camera.replace(image_size=(height, width))"
+        raise ValueError(f"{owner}: {name} must have an image_size; got None. Pass {how}")
     return camera
 
 

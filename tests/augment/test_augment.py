@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 import torch
-from cameras import DISTINCT, KEYS, PAIRS, slow_unless, spread
+from cameras import DISTINCT, KEYS, PAIRS, default_dtype_of_double, slow_unless, spread
 
 import camtorch as ct
 from camtorch.augment import PRESETS, RandomCamera, RandomLens, RandomMount
@@ -192,6 +192,8 @@ def test_replay_is_bit_identical(name, tmp_path):
     draw = augmentation.draw(5, torch.Generator().manual_seed(1))
     torch.save(draw, tmp_path / "draw.pt")
     again = torch.load(tmp_path / "draw.pt", weights_only=True)
+    with default_dtype_of_double():
+        equal(draw, augmentation.draw(5, torch.Generator().manual_seed(1)))
     first = augmentation(batch, draw=draw)
     equal(first, augmentation(batch, draw=again))
     equal(first, copy.deepcopy(augmentation)(batch, draw=draw))
@@ -247,6 +249,8 @@ def test_poses_turn_with_the_camera():
     gaze = rotation @ straight(batch["pitch_yaw"])[..., None]
     torch.testing.assert_close(straight(out["pitch_yaw"]), gaze[..., 0], atol=1e-6, rtol=0)
     assert torch.equal(straight(torch.zeros(2)), torch.tensor([0.0, 0.0, -1.0]))
+    one = RandomMount(camera=batch["camera"])(gaze=torch.rand(2, 3), rvec=batch["rvec"][0])  # both eyes of a head
+    assert one["rotation"].shape == (3, 3)
 
 
 def test_jittered_lenses_stay_invertible_and_bounded():

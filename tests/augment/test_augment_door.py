@@ -2,6 +2,7 @@
 
 import math
 
+import PIL.Image
 import pytest
 import torch
 
@@ -77,8 +78,9 @@ def test_fields(camera, fields, text):
 def test_cameras_and_draws(camera):
     mount, zooming, half = RandomMount(), RandomMount(zoom=(1, 2)), RandomMount(p=0.5, image_size=(15, 20))
     draw, given = mount.draw(2), {"keypoints": POINTS, "camera": camera}
-    samples = [zooming(given) for _ in range(2)]
+    samples, turned = ([aug(given) for _ in range(2)] for aug in (zooming, mount))
     zooming.inverse(samples[1])
+    mount.inverse(turned[1])
     some, wide = {"apply": torch.tensor([True, False])}, RandomLens("pinhole", fov=190)
     for call, text in (
         (lambda: wide(given), "fov must be within the reach of a pinhole lens of these coefficients; got 190 degrees"),
@@ -90,9 +92,12 @@ def test_cameras_and_draws(camera):
         (lambda: mount(given, draw=some), "draw must have yaw, pitch, roll, zoom; got apply"),
         (lambda: mount(given, draw={**draw, "yaw": draw["yaw"][:, None]}), r"\['yaw'\] must be \(2,\); .* \(2, 1\)"),
         (lambda: RandomMount().inverse(given), "must have a change to invert; got none. Call it first"),
-        (lambda: zooming.inverse(samples[0]), r"must be the one that this change made; got Pinhole\(.*another call"),
+        (lambda: zooming.inverse(samples[0]), r"must be those that this change made; got Pinhole\(.*another call"),
+        (lambda: mount.inverse(turned[0]), r"camera and rotation of the sample must be those that this change made"),
         (lambda: half(given, draw=half.draw(2) | some), "with p < 1 the image_size must be that of the images"),
-        (lambda: mount(torch.zeros(1, 3, *SIZE)), r"a sample must be a dict of fields, .* as in image=...; got Tensor"),
+        (lambda: mount(torch.zeros(1, 3, *SIZE)), r"a dict of fields, .* as in image=...; got Tensor\. For PIL"),
+        (lambda: mount(torch.zeros(1, 3, *SIZE), {}), r"3 were given\..* camtorch.augment.torchvision.Transform\("),
+        (lambda: mount(image=PIL.Image.new("RGB", (4, 4))), r"got Image\..* camtorch.augment.torchvision.Transform\("),
     ):
         with pytest.raises((TypeError, ValueError), match=text):
             call()

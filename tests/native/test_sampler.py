@@ -11,6 +11,7 @@ from itertools import product
 
 import pytest
 import torch
+from cameras import default_dtype_of_double
 
 import camtorch as ct
 from camtorch.native import build as building
@@ -395,15 +396,6 @@ def test_strange_tensors_are_images(kind, mode):
             with torch.no_grad():
                 result = fresh(STRANGE[kind](images_of_floats()), mode=mode)
             torch.testing.assert_close(result.detach().as_subclass(torch.Tensor), expected, atol=1e-4, rtol=0)
-
-
-@contextmanager
-def default_dtype_of_double():
-    torch.set_default_dtype(torch.float64)
-    try:
-        yield
-    finally:
-        torch.set_default_dtype(torch.float32)
 
 
 @pytest.mark.parametrize(("dtype", "mode"), [("uint8", "bilinear"), ("float32", "bicubic"), ("float16", "nearest")])

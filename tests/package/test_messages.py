@@ -28,6 +28,7 @@ PIXELS, RAYS = CAMERA.pixel_grid(), CAMERA.rays()[0]
 IMAGES = torch.zeros(2, 3, *SIZE)
 LEAF, EYE, HOLED = torch.ones((), requires_grad=True), np.eye(3), np.where(np.arange(160) == 7, math.nan, 0.0)
 DEEP, THREE = ct.Reproject(CAMERA, CAMERA, POSE), ct.RollingShutter(0.03, torch.zeros(3, 3))
+KORNIAS, MASKED = PinholeModel(ImageSize(*SIZE), torch.ones(4)), np.ma.masked_array(np.ones((2, 3)))
 NORMAL, SMALL, BOARDS = [0.1, 0.3, 1.0], CAMERA.resize(12, 16), ct.Extrinsics(torch.zeros(2, 3), torch.zeros(2, 3))
 CANONICAL, DEPTHS = (ct.CanonicalCamera(50.0, scales=scales, camera=CAMERA) for scales in ("image", "depth"))
 TWO = BATCH.replace(intrinsics=BATCH.intrinsics * torch.tensor([[1.0], [2.0]]))
@@ -56,6 +57,8 @@ WRONG = [
     (lambda: CAMERA.convert("fisheye62").camera.to_kornia(), ValueError, r"8 of 'fisheye62'. Write camera.convert"),
     (lambda: GRID.to_kornia(), ValueError, r"must have one batch dim or none; got \(2, 2\)"),
     (lambda: CAMERA.to_kornia(POSE), ValueError, r"must be None or the identity for kornia's KannalaBrandtK3"),
+    (lambda: ct.Pinhole(KORNIAS), TypeError, r"got PinholeModel; ct.from_kornia\(theirs\) makes a camera"),
+    (lambda: ct.Warp(CAMERA, KORNIAS), TypeError, r"target .* got PinholeModel; ct.from_kornia\(theirs\) makes"),
     (lambda: ct.Extrinsics([0.0, 0, 0, 1], [0.0, 0, 0]), ValueError, r"got shape \(4,\)\. For quaternions.*from_quat"),
     (lambda: ct.Pinhole([9.0] * 4, image_size=EYE), TypeError, r"\(height, width\); got ndarray of shape \(3, 3\)"),
     (lambda: ct.Extrinsics(0, 0, 1), TypeError, r"It takes ct.Extrinsics\(\[rx, ry, rz\], \[tx, ty, tz\]\)"),
@@ -65,6 +68,11 @@ WRONG = [
     (lambda: BOX_CROP(image=IMAGES[0], boxes=[[3.0, 4, 9, 9]]), TypeError, r"as torch.tensor\(numbers\); a list has a"),
     (lambda: MOUNT(image=IMAGES[0], keypoint=torch.ones(3, 2)), ValueError, r"real numbers.* Did you mean 'keypoints'"),
     (lambda: MOUNT(image=IMAGES[0], rvec=torch.ones(3, 1)), ValueError, r"OpenCV's column goes in as rvec\[..., 0\]"),
+    (lambda: MOUNT(image=IMAGES, gaze=torch.ones(2, 3, 1)), ValueError, r"column goes in as gaze\[..., 0\]"),
+    (lambda: MOUNT(image=IMAGES[0], head_pose=torch.eye(3)), ValueError, r"pad\(R, \(0, 1\)\), with zeros for the"),
+    (lambda: MOUNT(image=IMAGES[0], pose=torch.zeros(3)), ValueError, r"R = ct.head_rotation\(angles\), of pitch"),
+    (lambda: MOUNT(image=IMAGES[0], boxes=torch.ones(4)), ValueError, r"goes in as boxes\[..., None, :\]"),
+    (lambda: MOUNT(image=IMAGES, keypoints=MASKED[..., :2]), TypeError, r"keypoints .* got a MaskedArray: its mask"),
     (lambda: MOUNT(image=IMAGES[0], bbox=torch.tensor([[3, 4, 9, 9]])), ValueError, r"'bbox' .* Did you mean 'boxes'"),
     (lambda: MOUNT(image=IMAGES[0], seg=torch.ones(SIZE, dtype=torch.uint8)), ValueError, r"Did you mean 'mask'\?"),
     (lambda: MOUNT(image=IMAGES, parts=torch.ones(2, 5, 2).int()), ValueError, r"'parts' .*move with the camera"),
@@ -73,6 +81,7 @@ WRONG = [
     (lambda: CAMERA.project(torch.ones(5, 3).to_sparse()), TypeError, r"points must be a dense tensor; got"),
     (lambda: CAMERA.project(np.ones((3, 7))), ValueError, r"shape \(3, 7\)\. Pass points in columns as points\.T"),
     (lambda: ct.Warp(np.eye(3), CAMERA), TypeError, r"got ndarray \(3, 3\); ct\.BrownConrady\.from_matrix\(K, "),
+    (lambda: CAMERA.project(MASKED), TypeError, r"MaskedArray: its mask would be lost. Pass array.filled\(value\)"),
     (lambda: CAMERA.contains(torch.ones(3)), ValueError, r"pixels must be \(..., 2\); got shape \(3,\)"),
     (lambda: WARP.strips(IMAGES, rows=2.5), TypeError, r"Warp: rows must be a whole number; got 2.5"),
     (lambda: POSE.compose(np.eye(4)), TypeError, r"Extrinsics: other must be Extrinsics; got ndarray"),
@@ -98,13 +107,14 @@ WRONG = [
     (lambda: ONE.cameras["b"], KeyError, r"name of Camera must be one of 'a'; got 'b'"),
     # warps
     (lambda: ct.Warp(CAMERA, "target"), TypeError, r"Warp: target must be a Camera"),
-    (lambda: ct.Warp(ct.Pinhole([1.0, 1, 0, 0]), CAMERA), ValueError, r"Warp: source must have an image_size"),
+    (lambda: ct.Warp(ct.Pinhole([1.0, 1, 0, 0]), CAMERA), ValueError, r"an image_size; got None. Pass camera.rep"),
     (lambda: ct.Warp(CAMERA, CAMERA, 2 * torch.eye(3)), ValueError, r"rotation must hold rotation matrices"),
     (lambda: ct.ShutterWarp(CAMERA, CAMERA, shutter=0.03), TypeError, r"shutter must be a RollingShutter; got float"),
     (lambda: ct.ShutterWarp(BATCH, BATCH, shutter=THREE), ValueError, r"together; got cameras \(2, 1\) and shut"),
     (lambda: ct.Warp(CAMERA, CAMERA, fill=(1, 2))(IMAGES), ValueError, r"fill must have 1 value or 3, .* got 2"),
     (lambda: ct.Warp(CAMERA, BATCH)(IMAGES[:1].expand(3, -1, -1, -1)), ValueError, r"images must be 1 or 2, .* got 3"),
     (lambda: WARP(IMAGES.mT), ValueError, r"\(24, 32\).*\(32, 24\)"),
+    (lambda: WARP(MASKED), TypeError, r"Warp: images must be an array without a mask; got a MaskedArray: its mask"),
     (lambda: WARP(["image"]), TypeError, r"must be a tensor .*, an array .* or a PIL image; got list"),
     (lambda: WARP(IMAGES[0].numpy()), ValueError, r"got shape \(3, 24, 32\)\. .*np.moveaxis\(images, -3, -1\)"),
     (lambda: WARP(IMAGES[:, 0].numpy()), ValueError, r"\(2, 24, 32\)\. .* images\[..., None\] adds one"),
@@ -204,7 +214,16 @@ WRONG = [
     (lambda: ct.triangulate(np.eye(3), np.eye(3), 1, 2), TypeError, r"were given\. It takes lists: ct.triangulate\("),
     (lambda: ct.rectify(*[EYE] * 4, SIZE, EYE, EYE), TypeError, r"OpenCV's .* ct.rectify\(left, right, ct.Ext"),
     (lambda: ct.Dewarp(np.eye(3), np.zeros(4)), TypeError, r"were given\. It takes a camera, as .*from_matrix\(K, D"),
-    (lambda: ct.Dewarp(CAMERA, size=SIZE), TypeError, r"argument 'size'\. Did you mean 'image_size'\? It takes"),
+    (lambda: ct.views.cube(CAMERA, image_size=9), TypeError, r"Did you mean 'size'\? It takes cube\(camera, size\)"),
+    (lambda: ct.views.ring(CAMERA, 3, image_size=9), TypeError, r"Did you mean 'size'\? It takes ring\(camera"),
+    (lambda: ct.views.look_at(CAMERA, EYE, size=SIZE), TypeError, r"mean 'image_size'\? It takes look_at\(camera"),
+    (lambda: ct.fit("mei", PIXELS, RAYS, size=SIZE), TypeError, r"mean 'image_size'\? It takes fit\(model, pix"),
+    (lambda: augment.BoxCrop(size=SIZE), TypeError, r"BoxCrop: unknown keyword 'size'; did you mean 'image_size'\?"),
+    (
+        lambda: ct.Dewarp(CAMERA, size=SIZE),
+        TypeError,
+        r"^Dewarp.__init__\(\) got .* argument 'size'\. Did you mean 'image_size'\? It takes",
+    ),
     (lambda: ct.Dewarp(CAMERA, balance=0.5), TypeError, r"argument 'balance'\. It takes .* fov is how much it"),
     (lambda: ct.Pinhole.from_matrix(np.eye(3), None, SIZE), TypeError, r"given\. It takes from_matrix\(K, dist"),
     (lambda: ct.Pinhole.from_fov(90), TypeError, r"'image_size'\. It takes from_fov\(degrees, image_size="),
