@@ -26,7 +26,7 @@ from camtorch.values.arguments import (
     hinting,
     shown,
 )
-from camtorch.values.module import BatchedModule, learning_as, remade, typed_as
+from camtorch.values.module import BatchedModule, learning_as, remade
 
 
 class Extrinsics(BatchedModule):
@@ -93,9 +93,7 @@ class Extrinsics(BatchedModule):
         return restore(turned + translation.mT.unsqueeze(-1))
 
     if TYPE_CHECKING:
-
-        @typed_as(forward)
-        def __call__(self, *args: Any, **options: Any) -> Any: ...
+        __call__ = forward
 
     def matrix(self) -> Tensor:
         """Return the matrices (*B, 4, 4) [[R, t], [0, 1]]."""

@@ -23,7 +23,6 @@ from camtorch.values.arguments import (
     no_camera,
     one_of,
 )
-from camtorch.values.module import typed_as
 from camtorch.warp import plan
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
@@ -184,9 +183,7 @@ class Warp(CameraPair):
         return plan.warped(self, images, sampler)
 
     if TYPE_CHECKING:
-
-        @typed_as(forward)
-        def __call__(self, *args: Any, **options: Any) -> Any: ...
+        __call__ = forward
 
     def strips(
         self,
