@@ -71,50 +71,30 @@ class Transform(FrontEnd):
         **fields: Any,
     ) -> Sample:
         """Augment a sample: keyword arguments, a dict, or both; see `Augmentation.forward` for the other arguments."""
-        options = {"draw": draw, "generator": generator}
-        return self._moved(self.augmentation.forward, sample, fields, options, self.camera)
-
-    def inverse(
-        self,
-        sample: Mapping[str, Any] | None = None,
-        *,
-        draw: Mapping[str, Tensor] | None = None,
-        camera: Camera | None = None,
-        **fields: Any,
-    ) -> Sample:
-        """Move a sample back, see `Augmentation.inverse`: by the last call's change, or by `draw` and its `camera`."""
-        options = {} if draw is None else {"draw": draw, "camera": self.camera if camera is None else camera}
-        if draw is None and camera is not None:
-            fields["camera"] = camera
-        with torch.no_grad():  # as the camera before may learn
-            return self._moved(self.augmentation.inverse, sample, fields, options)
-
-    def __repr__(self) -> str:
-        return f"Transform({self.augmentation!r})"
-
-    def _moved(
-        self, move: Callable[..., Sample], sample: Any, fields: Sample, options: Sample, otherwise: Camera | None = None
-    ) -> Sample:
         if sample is not None and not isinstance(sample, Mapping):
             raise TypeError(
                 f"{_OWNER}: sample must be a dict, or keywords as in transform(image=...); got {type(sample).__name__}"
             )
         sample = {**(sample or {}), **fields}
-        if sample.get("camera") is None and otherwise is not None:
-            sample["camera"] = otherwise
+        if sample.get("camera") is None and self.camera is not None:
+            sample["camera"] = self.camera
         camera = self.augmentation._held("camera") if sample.get("camera") is None else sample["camera"]
         size = getattr(camera, "image_size", None)
-        options = {key: value for key, value in options.items() if value is not None}
+        given = {"draw": draw, "generator": generator}
+        options = {name: value for name, value in given.items() if value is not None}  # a FaceNormalizer has none
         entries = {name: self._entry(name, value, sample, size) for name, value in sample.items()}
         inside = {key: tensor for tensors, _ in entries.values() for key, tensor in tensors.items()}
         with torch.no_grad():
-            moved = move(Single(inside), **options)
+            moved = self.augmentation.forward(Single(inside), **options)
         result = {name: to(moved) for name, (tensors, to) in entries.items() if tensors.keys() <= moved.keys()}
         for name in moved.keys() - inside.keys():
             value = plain(moved[name]) if isinstance(moved[name], Tensor) else moved[name]
             flat = name.endswith(_VALID) and value.ndim == 3 and self._kind(name, value, sample) in IMAGES
             result[name] = value[0] if flat else value
         return result
+
+    def __repr__(self) -> str:
+        return f"Transform({self.augmentation!r})"
 
     def _kind(self, name: str, value: Any, sample: Mapping[str, Any]) -> str | None:
         """Return the kind of a field, or of the field whose validity it is; None if it is not moved."""

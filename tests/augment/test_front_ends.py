@@ -81,20 +81,12 @@ def test_layouts_lists_and_what_was_valid_before():
     assert (empty.shape, empty.dtype) == ((0, 20, 30), np.uint8)
 
 
-def test_there_and_back():
-    image, _, points, _ = images()
+def test_a_draw_and_a_generator_give_the_same():
+    points = images()[2]
     transform = ct.augment.numpy.Transform(ct.augment.RandomMount(), camera())
-    out = transform(image=image, keypoints=points[:2], gaze=[0.0, 0.6, -0.8])
-    back = transform.inverse(**out)
-    learns = ct.augment.numpy.Transform(ct.augment.RandomMount())
-    assert learns.inverse(learns(image=image.astype(np.float32), camera=camera()))["image"].dtype == np.float32
-    for name, value in (("keypoints", points[:2]), ("gaze", [0, 0.6, -0.8]), ("rotation", np.eye(3))):
-        np.testing.assert_allclose(back[name], value, atol=1e-3 if name == "keypoints" else 1e-6)
     draw = transform.augmentation.draw(1, torch.Generator().manual_seed(5))
     moved = transform(keypoints=points, generator=torch.Generator().manual_seed(5))["keypoints"]
     np.testing.assert_array_equal(moved, transform(keypoints=points, draw=draw)["keypoints"])
-    again = transform.inverse(keypoints=moved[:2], draw=draw)
-    np.testing.assert_allclose(again["keypoints"], points[:2], atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["keypoints", "landmarks"])
