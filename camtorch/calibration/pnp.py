@@ -130,17 +130,17 @@ def solve_pnp(
         task = _Task.of(given)  # the poses and the root mean squares with their derivatives
         task = task._replace(weights=torch.where(found.inliers, task.weights, 0.0))
         middles = task.middles[..., None]
-        centred = found.translations + (rotation_matrix(found.vectors) @ middles)[..., 0]
-        unknowns = attached(task.cost, torch.cat((found.vectors, centred), -1), found.valid)
-        turns, centred = unknowns.split(3, -1)
-        shifts = centred - (rotation_matrix(turns) @ middles)[..., 0]
+        centred = translations + (rotation_matrix(vectors) @ middles)[..., 0]
+        unknowns = attached(task.cost, torch.cat((vectors, centred), -1), found.valid)
+        vectors, centred = unknowns.split(3, -1)
+        translations = centred - (rotation_matrix(vectors) @ middles)[..., 0]
         means = 2 * task.cost(unknowns) / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
-        vectors, translations, rms = turns, shifts, root_of(means, found.valid)
-    vectors, translations = (t.to(given.dtype).view(*given.batch, 3) for t in (vectors, translations))
-    rms = rms.to(given.dtype).view(given.batch)
-    inliers = found.inliers.view(*given.batch, found.inliers.shape[-1])
-    covariance = found.covariance.to(given.dtype).view(*given.batch, 6, 6)
-    return Pose(_frozen_pose(vectors, translations), rms, found.valid.view(given.batch), inliers, covariance)
+        rms = root_of(means, found.valid)
+    vectors, translations, rms, covariance = (
+        t.to(given.dtype).view(given.batch + t.shape[1:]) for t in (vectors, translations, rms, found.covariance)
+    )
+    valid, inliers = (t.view(given.batch + t.shape[1:]) for t in (found.valid, found.inliers))
+    return Pose(_frozen_pose(vectors, translations), rms, valid, inliers, covariance)
 
 
 def _solve_each_model(
@@ -196,24 +196,21 @@ class _Given(NamedTuple):
         count = seen_at.shape[-2]
         given = None if weights is None else as_tensor(weights, "weights", owner, device)
         shapes = f"object_points {tuple(points.shape)} and pixels {tuple(seen_at.shape)}"
-        if points.shape[-2] != count:
+        if points.shape[-2] != count or count < _LEAST:
             hint = "Pad rows of fewer points with NaN pixels"
-            raise ValueError(f"{owner}: object_points and pixels must be as many points; got {shapes}. {hint}")
-        if count < _LEAST:
-            raise ValueError(f"{owner}: points must be at least {_LEAST} a row; got {shapes}")
-        if given is not None:
-            if given.shape[-1:] != (count,):
-                raise ValueError(f"{owner}: weights must be (*B, N) with N = {count}; got shape {tuple(given.shape)}")
-            if not bool((given >= 0).all()):
-                raise ValueError(f"{owner}: weights must not be negative; got {given.detach().min().item():.4g}")
+            raise ValueError(
+                f"{owner}: object_points and pixels must be as many points, {_LEAST} or more; got {shapes}. {hint}"
+            )
+        if given is not None and (given.shape[-1:] != (count,) or not bool((given >= 0).all())):
+            got = f"shape {tuple(given.shape)}, down to {given.detach().min().item():.4g}"
+            raise ValueError(f"{owner}: weights must be (*B, N) with N = {count}, and not negative; got {got}")
         leads = points.shape[:-2], seen_at.shape[:-2], () if given is None else given.shape[:-1]
         try:
             batch = broadcast_shapes(camera.batch_shape, *leads)
         except ValueError:
-            raise ValueError(
-                f"{owner}: batch dims must broadcast; got {shapes}, weights of {leads[2]} and a camera of "
-                f"{tuple(camera.batch_shape)}"
-            ) from None
+            own = tuple(camera.batch_shape)
+            got = f"{shapes}, weights of {leads[2]} and a camera of {own}"
+            raise ValueError(f"{owner}: batch dims must broadcast; got {got}") from None
         dtype = working_dtype(points, seen_at, *camera._tensors)
 
         def rows(values: Tensor, *size: int) -> Tensor:

@@ -156,11 +156,5 @@ def uncertainty(spread: Spread, pixels: Numbers, distance: Numbers = math.inf) -
     if not bool((distance > 0).all()):
         got = distance.tolist()
         raise ValueError(f"{owner}: distance must be positive, in the unit of the board, or math.inf; got {got}")
-    try:
-        distance = distance.expand(shape)
-    except RuntimeError:
-        raise ValueError(
-            f"{owner}: distance must be one number, or one for each pixel {tuple(shape)}; got shape "
-            f"{tuple(distance.shape)}"
-        ) from None
+    distance = distance.expand(shape)
     return worst(spread.of_pixels(pixels.reshape(1, -1, 2), distance.reshape(1, -1)))[0].view(shape)

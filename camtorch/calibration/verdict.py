@@ -133,20 +133,17 @@ class Calibration:
             return f"Do not use this camera: {self.failure}."
         survey, good = _Survey(self), "Not for measuring"
         # the noise does not cover errors of the model at rays far from any corner
-        fine, fine_share = survey.good_within(_FINE, survey.reach + _BEYOND)
-        rough, rough_share = survey.good_within(_ROUGH)
-        if fine_share > 0:
-            share = f"{_percent(fine_share)} of the image"
-            good = f"Good for measuring up to {_degrees(fine)} from the optical axis, {share}"
+        fine, rough = survey.good_within(_FINE, survey.reach + _BEYOND), survey.good_within(_ROUGH)
+        if fine[1] > 0:
+            good = "Good for measuring up to {} from the optical axis, {} of the image".format(*_angle_and_share(fine))
         good += f": projections are known to {_px(survey.middle)} in the middle (standard deviation)."
-        if rough_share > fine_share:
-            good += f" Good for looking at up to {_degrees(rough)}, {_percent(rough_share)} of the image."
-        reach = f"Corners were seen up to {_degrees(survey.reach)}; the image goes to {_degrees(survey.image_reach)}."
+        if rough[1] > fine[1]:
+            good += " Good for looking at up to {}, {} of the image.".format(*_angle_and_share(rough))
         ahead = "Four times as many views would halve the uncertainty."
         if survey.weak:
-            where = _words(survey.weak[:3])
-            ahead = f"Next, hold the board in {where} of the image, so near that its corners reach the edges."
-        return f"{good} {reach} {ahead}" + (f" {_TILTED}." if survey.tilt < _ALIKE else "")
+            ahead = f"Next, hold the board in {survey.weak} of the image, so near that its corners reach the edges."
+        tilt = f" {_TILTED}." if survey.tilt < _ALIKE else ""
+        return f"{good} Corners were seen up to {survey.reaches}. {ahead}{tilt}"
 
     def __repr__(self) -> str:
         values = [*self.camera.intrinsics.tolist(), *self.camera.distortion.tolist()]
@@ -171,11 +168,13 @@ class _Survey:
         rays, self.has_ray = calibration.camera.unproject(pixels)
         self.angles = torch.where(self.has_ray, angles_from_axis(rays), torch.nan)  # radians from the axis
         self.uncertainty = calibration.uncertainty(pixels)  # px, of directions; NaN without a ray
-        pose = calibration.extrinsics.matrix().to(self.seen.device)
-        self.points = calibration.observations.points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]  # of the camera
-        angles = angles_from_axis(self.points[self.seen]).sort().values
+        self.poses = calibration.extrinsics.matrix().to(self.seen.device)
+        self.points = calibration.observations.points
+        points = self.points @ self.poses[:, :3, :3].mT + self.poses[:, None, :3, 3]
+        angles = angles_from_axis(points[self.seen]).sort().values
         self.reach = float(angles[math.ceil(0.995 * len(angles)) - 1])  # without one corner in 200, which may be wrong
         self.image_reach = float(self.angles.nan_to_num(0.0).amax())
+        self.reaches = f"{_degrees(self.reach)}; the image goes to {_degrees(self.image_reach)}"
         # a fisheye's corners reach nearly to the circle at which its image ends
         ends_in_the_dark = self.reach > _FISHEYE and self.image_reach > self.reach + _RIM
         self.without_rays = 0.0 if ends_in_the_dark else float((~self.has_ray).double().mean())
@@ -185,7 +184,7 @@ class _Survey:
         most = [float(part.amax()) for band in values.tensor_split(3) for part in band.tensor_split(3, -1)]
         self.middle = most[4]
         weak = [pair for pair in zip(most, names, strict=True) if pair[0] > max(_FINE, 3 * self.middle)]
-        self.weak = [name for _, name in sorted(weak, reverse=True)]
+        self.weak = " and ".join(", ".join(name for _, name in sorted(weak, reverse=True)[:3]).rsplit(", ", 1))
 
     def good_within(self, limit: float, furthest: float = math.inf) -> tuple[float, float]:
         """Return the angle from the axis up to which projections are certain to `limit` px, and the image's part."""
@@ -194,18 +193,14 @@ class _Survey:
         within = self.angles < torch.where(bad, self.angles, torch.inf).amin()
         return float(torch.where(within, self.angles, 0.0).amax()), float(within.double().mean())
 
-    @cached_property
+    @property
     def tilt(self) -> float:
-        """The largest angle between two boards, in radians; infinite if a board is not flat."""
-        weights = self.seen.to(self.points)[..., None]
-        middle = (self.points * weights).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp(min=1)
-        _, sizes, axes = torch.linalg.svd((self.points - middle) * weights, full_matrices=False)
-        used = self.seen.any(-1)
-        if not bool(used.any()) or bool((sizes[used, 2] > 1e-3 * sizes[used, 1]).any()):
-            return math.inf
-        normals = axes[used, 2]
-        normals = torch.where((normals * middle[used, 0]).sum(-1, keepdim=True) > 0, -normals, normals)
-        return float(torch.acos((normals @ normals.mT).clamp(-1, 1)).amax())
+        """The largest angle between two boards, in radians; infinite if they are not flat."""
+        points = self.points[self.seen]
+        _, sizes, axes = torch.linalg.svd(points - points.mean(0), full_matrices=False)
+        normals = self.poses[self.seen.any(-1), :3, :3] @ axes[2]
+        flat = bool(sizes[2] <= 1e-3 * sizes[1])
+        return float(torch.acos((normals @ normals.mT).clamp(-1, 1)).amax()) if flat else math.inf
 
 
 def _of_residuals(calibration: Calibration) -> Iterator[str]:
@@ -219,21 +214,18 @@ def _of_residuals(calibration: Calibration) -> Iterator[str]:
     if calibration.sigma > _CORNER_NOISE * max(1.0, max(calibration.image_size) / 2000):
         yield (
             f"Residuals are {_px(calibration.sigma)} per coordinate, far more than the errors of corners: the board "
-            "may be bent or not as described, images out of focus or smeared, or the model not that of the lens"
+            "may be bent or not as described, images smeared, or the model not that of the lens"
         )
     bad, squares = seen & ~inliers, calibration.point_residuals.square().sum(-1)
     per_view, count, total = bad.sum(-1), int(bad.sum()), int(seen.sum())
     usual = float(squares[inliers].mean()) / 2 if bool(inliers.any()) else 0.0
     # so many normal errors exceed three standard deviations, and none exceeds six
     if count > 3 + 2 * math.exp(-4.5) * total or bool((squares[bad] > 36 * usual).any()):
-        most = int(per_view.argmax())
         robust = "" if calibration.loss else ': loss="huber" keeps them from pulling'
-        yield (
-            f"{count} of {total} corners are outliers, {int(per_view[most])} of them in view "
-            f"{calibration.views[most]}{robust}. Look at the views"
-        )
-    pixels = calibration.observations.pixels
-    rounding = torch.finfo(torch.float32).eps * float(pixels.abs().amax())  # px: corners may be float32
+        most = f"{int(per_view.max())} of them in {named([calibration.views[int(per_view.argmax())]])}"
+        yield f"{count} of {total} corners are outliers, {most}{robust}. Look at the views"
+    # px: corners may be float32
+    rounding = torch.finfo(torch.float32).eps * float(calibration.observations.pixels.abs().amax())
     rms = ((squares * seen).sum(-1) / seen.sum(-1)).sqrt()  # NaN for views of a rig that this camera does not see
     middle = float(rms.nanmedian())
     worse = (rms > max(_WORSE_VIEW * middle, rounding)).nonzero()[:, 0].tolist()
@@ -242,8 +234,7 @@ def _of_residuals(calibration: Calibration) -> Iterator[str]:
             f"The rms of {named([calibration.views[i] for i in worse])} is up to {_px(float(rms[worse].amax()))}, and "
             f"{_px(middle)} is usual. Look at the corners, or leave such views out: they widen all uncertainties"
         )
-    share = _pattern_share(calibration) if calibration.rms > rounding else 0.0
-    if share > _PATTERN_SHARE:
+    if calibration.rms > rounding and (share := _pattern_share(calibration)) > _PATTERN_SHARE:
         yield (
             f"The residuals have a pattern over the image, of {_px(share * calibration.rms)}: the model is not that of "
             "the lens, or the board is bent. Try brown_conrady with count=8, kannala_brandt or fisheye624, or bend=True"
@@ -270,23 +261,19 @@ def _pattern_share(calibration: Calibration) -> float:
 def _of_data(calibration: Calibration, survey: _Survey) -> Iterator[str]:
     """Generate warnings about views and their places in the image."""
     if calibration.copies:
-        yield (
-            f"Copies of other views, or nearly so, are {named(calibration.copies)}: they count once. "
-            "Take new photographs instead"
-        )
+        yield f"Copies of other views, or nearly so, are {named(calibration.copies)}: they count once. Take new ones"
     count = int(survey.seen.any(-1).sum()) - len(calibration.copies)
     if count < _FEW_VIEWS:
         yield f"Few views ({count}): a bad one cannot be detected. Take 10 to 20. {_TILTED}"
     if count > 1 and survey.tilt < _ALIKE and bool((survey.uncertainty > _FINE).any()):
         within = _degrees(survey.tilt)
         yield f"All boards are parallel to within {within}, which leaves the focal length uncertain. {_TILTED}"
-    end, without = survey.image_reach, survey.without_rays
-    if without > 0.001 or survey.good_within(_ROUGH)[0] < end:
+    without = survey.without_rays
+    if without > 0.001 or survey.good_within(_ROUGH)[0] < survey.image_reach:
         inside = f", where the lens ends: {_percent(without)} of the pixels have no ray" if without > 0.001 else ""
-        where = _words(survey.weak[:3]) if survey.weak else "the corners"
         yield (
-            f"Corners reach {_degrees(survey.reach)} from the axis, and the image {_degrees(end)}{inside}. The lens is "
-            f"a guess in {where} of the image: hold the board there"
+            f"Corners reach {survey.reaches}{inside}. The lens is a guess in {survey.weak or 'the corners'} of the "
+            "image: hold the board there"
         )
 
 
@@ -320,16 +307,16 @@ def check_determined(
     )
 
 
-def _words(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
 def _px(value: float) -> str:
     return f"{value:.0f} px" if 99.5 <= value < 1e6 else f"{value:.2g} px"
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share > 0.095 else f"{100 * share:.2g} %"
+
+
+def _angle_and_share(good: tuple[float, float]) -> tuple[str, str]:
+    return _degrees(good[0]), _percent(good[1])
 
 
 def _degrees(angle: float) -> str:

@@ -60,7 +60,7 @@ def test_good_data_have_no_warnings():
 
 
 def test_real_corners(left):
-    assert "bottom left, the top left" in one(left.warnings, "28 degrees .* 41 degrees. The lens is a guess in")
+    assert "bottom left, the top left" in one(left.warnings, "28 degrees; .* 41 degrees. The lens is a guess in")
     assert "up to 31 degrees" in left.verdict
     assert "Next, hold the board in the bottom left, the top left and" in left.verdict
     assert all(f"  ! {text}" in repr(left) for text in left.warnings)
