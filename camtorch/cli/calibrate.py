@@ -38,19 +38,14 @@ def run(arguments: argparse.Namespace) -> None:
     words = "{} {}x{}".format(arguments.type or "chessboard", *arguments.board)
     board = as_board(words, arguments.square or 1.0, options, "--board")
     if board.is_symmetric and len(cameras) > 1:
-        note(
-            "this board looks the same after a turn: the corner nearest to the top left of an image is taken as its "
-            "first one, so hold the cameras alike. An even and an odd number of corners, as in 9x6, avoid this"
-        )
+        note("this board looks the same after a turn: hold the cameras alike, or use even and odd corners, as in 9x6")
     views, sizes = find_views(cameras, board, "" if arguments.square is None else "m")
     if arguments.square is None:
         note("no --square is given: distances are in sides of a square")
     result = _calibrated(arguments, board, views, sizes, candidates)
     if not result.converged:
-        raise ValueError(
-            f"the calibration must converge; got rms {result.rms:.4g} px, nothing is written. Check --board and the "
-            "images, or try another --model, or --loss huber if some corners are wrong"
-        )
+        hint = "nothing is written. Check --board and the images, or try another --model, or --loss huber"
+        raise ValueError(f"the calibration must converge; got rms {result.rms:.4g} px, {hint}")
     names = list(views) if isinstance(result, RigCalibration) else [of_view[""].path.name for of_view in views.values()]
     text = repr(result)  # with names of views instead of numbers, and options instead of arguments
     numbered = r"\b([Vv]iews? )(\d+(?:, \d+)*)"
@@ -70,16 +65,13 @@ def _cameras(arguments: argparse.Namespace) -> dict[str, list[Path]]:
     pair = {name: words for name in ("left", "right") if (words := getattr(arguments, name))}
     if sum(map(bool, (arguments.images, pair, arguments.rig))) > 1:
         raise ValueError("one of IMAGE, --left with --right, and --rig must be given; got several")
+    for word in arguments.rig or ():
+        name, _, images = word.partition("=")
+        if not (name and images):
+            raise ValueError(f"--rig must be NAME=IMAGE, as in cam0=folder or cam1='right*.png'; got {word!r}")
+        pair.setdefault(name, []).append(images)
     if len(pair) == 1:
-        raise ValueError(f"--left and --right must both be given; got --{next(iter(pair))} alone")
-    if arguments.rig:
-        for word in arguments.rig:
-            name, _, images = word.partition("=")
-            if not (name and images):
-                raise ValueError(f"--rig must be NAME=IMAGE, as in cam0=folder or cam1='right*.png'; got {word!r}")
-            pair.setdefault(name, []).append(images)
-        if len(pair) < 2:
-            raise ValueError("--rig must have several cameras; got one. Give its images without --rig")
+        raise ValueError("--left with --right, or --rig, must have several cameras; got one")
     if not (pair or arguments.images):
         raise ValueError("images must be given. Name files, quoted patterns, folders or a video")
     return {name: gather(words) for name, words in (pair or {"": arguments.images}).items()}
@@ -99,10 +91,8 @@ def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
         if kind.names_of(tried[0][1]) is None:
             raise ValueError(f"--count must be {kind.counts_text()} for {model}; got {count}")
         if kind.smoothness() is not None:
-            raise ValueError(
-                f"--model must need no known lens; got {model}. In Python write fitted = ct.calibrate(...) "
-                f"of another model, then ct.calibrate({model!r}, ..., start=fitted.camera)"
-            )
+            way = f"In Python write ct.calibrate({model!r}, ..., start=camera)"
+            raise ValueError(f"--model must need no known lens; got {model}. {way}")
     held = []
     for key, number in tried:
         kind = MODELS[key]

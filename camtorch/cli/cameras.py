@@ -45,10 +45,8 @@ def read_rig(
         return Rig({"camera": guessed})
     rig = load(path) if model is None else opencv.read_rig(path, model)
     if stated and model is None and rig.format == "opencv" and _leaves_open(path):
-        raise ValueError(
-            f"{path}: the model of 4 coefficients must be named; got none. Write --from-model kannala_brandt if they "
-            "are from cv2.fisheye, else --from-model brown_conrady"
-        )
+        way = "Write --from-model kannala_brandt if they are from cv2.fisheye, else --from-model brown_conrady"
+        raise ValueError(f"{path}: the model of 4 coefficients must be named; got none. {way}")
     if name is not None:
         if name not in rig.cameras and name not in rig.images:
             raise ValueError(f"{path}: name must be one of {', '.join(rig.cameras)}; got {name!r}")
@@ -97,10 +95,8 @@ def read_for_images(
     sized = ((image, size) for image in images if (size := size_of(image)))
     first, size = next(sized, (images[0], None))
     if path is None:
-        raise ValueError(
-            f"{first}: a camera must be given: --camera FILE, its calibration, or --lens NAME. An image alone "
-            "is not enough; --guess-fov DEGREES guesses"
-        )
+        way = "--camera FILE, its calibration, or --lens NAME. --guess-fov DEGREES guesses"
+        raise ValueError(f"{first}: a camera must be given: {way}")
     is_file = not str(path).startswith((LENS, GUESS))
     camera = read_camera(path, arguments.name, arguments.from_model, None if is_file else size)
     if size is not None:
@@ -130,10 +126,8 @@ def _unfitting(camera: Camera, size: Size, rescale: bool) -> str:
     shapes = size[1] / size[0], camera.width / camera.height
     if max(shapes) <= (1 + _ASPECT) * min(shapes):
         return "" if rescale else "--rescale scales the camera to the image"
-    return (
-        f"Their aspect ratios, {shapes[0]:.4g} and {shapes[1]:.4g}, differ by more than {100 * _ASPECT:g} %: the image "
-        "may be cropped, which --rescale does not undo"
-    )
+    ratios = f"{shapes[0]:.4g} and {shapes[1]:.4g}, differ by more than {100 * _ASPECT:g} %"
+    return f"Their aspect ratios, {ratios}: the image may be cropped, which --rescale does not undo"
 
 
 def _shown(size: Size) -> str:

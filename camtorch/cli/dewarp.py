@@ -22,7 +22,6 @@ from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.warp import Warp
 
 _SLASHES = ("/", os.sep)
-_CALIBRATIONS = (".yml", ".yaml", ".json", ".xml")
 _TOLERANCE = 0.001  # invisible; allows a lattice of positions for float64 calibrations too
 _MOST_KEPT = 4  # warps of images of different sizes
 _MUCH = 0.6  # part of a photograph; if less is visible, a hint names wider projections
@@ -95,8 +94,6 @@ def run(arguments: argparse.Namespace) -> int:
     output = Path(arguments.output or f"dewarped{videos.written_suffix(source) if is_video else '.png'}")
     targets.check(output, force=arguments.force, inputs=(source, arguments.camera))
     images.check_kind(output, is_video=is_video)
-    if not source.exists():
-        raise ValueError(f"{source}: no such file")
     work = _dewarping(arguments, [source])
     if is_video:
         with bar("dewarping", videos.count_of(source), "frames") as shown:
@@ -113,11 +110,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _many(arguments: argparse.Namespace) -> int:
     """Dewarp all files, and print the results; return the exit status, 1 if any failed."""
-    if any(Path(name).suffix.lower() in _CALIBRATIONS for name in arguments.image):
-        raise ValueError(
-            f"{' '.join(arguments.image)}: must be images; got others. Name the calibration with --camera, and with -o "
-            "the new image: camtorch dewarp photo.jpg --camera camera.yml -o straight.png"
-        )
     known = IMAGES | videos.FORMATS
     output = targets.folder(arguments.output, known)
     found = targets.find(arguments.image, known, output)
@@ -138,10 +130,9 @@ def _many(arguments: argparse.Namespace) -> int:
     for source, text in failed.items():
         say(f"error: {source}: {text}")
     alike = facts and all(one == facts[0] for one in facts)
-    parts = [f"{len(facts)} of {len(pairs)} files made" + (f", {_described(arguments, facts[0])}" if alike else "")]
-    parts += [f"{len(pairs) - len(todo)} were there already"] if len(pairs) > len(todo) else []
-    parts += [f"{len(failed)} failed"] if failed else []
-    print(f"{output}: {'; '.join(parts)}")
+    text = f"{len(facts)} of {len(pairs)} files made" + (f", {_described(arguments, facts[0])}" if alike else "")
+    text += f"; {len(pairs) - len(todo)} were there already" if len(pairs) > len(todo) else ""
+    print(f"{output}: {text}" + (f"; {len(failed)} failed" if failed else ""))
     return 1 if failed else 0
 
 

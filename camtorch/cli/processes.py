@@ -80,7 +80,6 @@ def _begin(pickled: bytes) -> None:
     import torch
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles interrupts
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that partial files are removed
     threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     _work = pickle.loads(pickled)
@@ -99,9 +98,14 @@ def _attempt(pair: Pair, work: Work | None = None) -> Outcome:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:
+            if work is None:
+                signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # removes the partial file
             facts = (work or _work)(*pair)
-        except SystemExit:  # the executor would continue
+        except SystemExit:  # after which the executor would continue
             os._exit(1)
         except Exception as error:
             return Outcome(failure=reason(error))
+        finally:
+            if work is None:
+                signal.signal(signal.SIGTERM, signal.SIG_DFL)
     return Outcome(facts, notes=list(dict.fromkeys(str(warning.message) for warning in caught)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,16 +50,12 @@ def find_views(
         for path, why in left_out:
             note(f"{path} is left out: {why}")
         if len(used) < _LEAST_VIEWS:
-            raise ValueError(
-                f"the board must be found in {_LEAST_VIEWS} images, better 20; got {len(used)} of {len(seen)}"
-                f"{f' of {name}' if name else ''}. Check that it is {board.words()}"
-            )
+            got = f"{len(used)} of {len(seen)}{f' of {name}' if name else ''}. Check that it is {board.words()}"
+            raise ValueError(f"the board must be found in {_LEAST_VIEWS} images, better 20; got {got}")
         height, width = sizes[name] = used[0].image_size
         corners = sum(int(np.isfinite(image.pixels[:, 0]).sum()) for image in used)
-        print(
-            f"{f'{name}: ' if name else ''}{board.words(unit)}: in {len(used)} of {len(seen)} images of "
-            f"{width}x{height}, {corners} corners"
-        )
+        where = f"in {len(used)} of {len(seen)} images of {width}x{height}, {corners} corners"
+        print(f"{f'{name}: ' if name else ''}{board.words(unit)}: {where}")
         good = {image.path for image in used}
         for view, image in seen:
             if image.path in good:
@@ -76,8 +72,7 @@ def take_together(cameras: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, 
     """Return view -> camera -> image of images with the same name, else last number, else position."""
     if film := next((path for paths in cameras.values() for path in paths if videos.is_video(path)), None):
         raise ValueError(f"{film}: videos must be of one camera, as frames of two have no common time; got several")
-    keys: tuple[Callable[[Path], str | None], ...] = (lambda path: path.stem, _last_number)
-    for key in keys:
+    for key in (lambda path: path.stem, _last_number):
         keyed = {name: {key(path): path for path in paths} for name, paths in cameras.items()}
         if all(None not in of and len(of) == len(cameras[name]) for name, of in keyed.items()):
             seen = Counter(view for of in keyed.values() for view in of)
@@ -87,10 +82,7 @@ def take_together(cameras: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, 
                 return {str(view): {name: of[view] for name, of in keyed.items() if view in of} for view in ordered}
     if len({len(paths) for paths in cameras.values()}) > 1:
         counts = ", ".join(f"{len(paths)} of {name}" for name, paths in cameras.items())
-        raise ValueError(
-            "images taken together must have the same name, or the same last number, or be as many in their order; "
-            f"got {counts}"
-        )
+        raise ValueError(f"images taken together must have the same name or last number, or be as many; got {counts}")
     rows = zip(*cameras.values(), strict=True)
     return {str(i): dict(zip(cameras, row, strict=True)) for i, row in enumerate(rows)}
 
@@ -133,10 +125,7 @@ def _sharpest(path: Path) -> list[_Moment]:
         for seconds, frame in videos.frames(path):
             shown.update()
             if seconds == 0 and frame.rotation:
-                note(
-                    f"{path}: is shown turned by {frame.rotation} degrees; the camera is that of the frames as they "
-                    "are stored, which is how `camtorch dewarp` takes them"
-                )
+                note(f"{path}: is shown turned by {frame.rotation} degrees; the camera is that of the stored frames")
             grey = frame.to_ndarray(format="gray")
             small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
             keep(int(seconds / moment), (seconds, float(cv2.Laplacian(small, cv2.CV_32F).var()), grey))

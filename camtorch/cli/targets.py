@@ -29,7 +29,7 @@ def check(path: Path, *, force: bool, inputs: tuple[Path | None, ...] = ()) -> N
 def folder(text: str | None, suffixes: Collection[str]) -> Path:
     """Return the folder of -o, for files of these suffixes."""
     if text is None:
-        raise ValueError("-o must be given. Write -o OUT/ for several images, -o out.png for one")
+        raise ValueError("-o must be given. Write -o OUT/ for several images, -o out.png for one, and --camera FILE")
     path = Path(text)
     if os.path.lexists(path) and not path.is_dir():
         raise ValueError(f"{path}: -o must be a folder for several images or a folder of them; got a file")

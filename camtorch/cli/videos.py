@@ -38,7 +38,7 @@ def written_suffix(path: Path) -> str:
 
 
 def require() -> Any:
-    """Return PyAV; if it is missing, raise an ImportError with the line to install it."""
+    """Return PyAV, or raise an ImportError with the line to install it."""
     return imported("av", "videos need PyAV", "video")
 
 
@@ -81,8 +81,8 @@ def frames(path: Path) -> Iterator[tuple[float, Any]]:
 def _span(container: Any) -> tuple[float, float]:
     """Return the start time and the length of a file in seconds; 0 if the file does not state them."""
     begin, length = ((value or 0) / 1e6 for value in (container.start_time, container.duration))
-    is_end = "matroska" in container.format.name  # Matroska states the end instead
-    return begin, max(length - begin, 0.0) if is_end else length
+    # Matroska states the end instead
+    return begin, max(length - begin, 0.0) if "matroska" in container.format.name else length
 
 
 def _rate(stream: Any) -> Fraction:
@@ -159,9 +159,6 @@ def remake(
                 packet.stream = copies[packet.stream.index]
                 output.mux(packet)
                 continue
-            if (frame.height, frame.width) != (first.height, first.width):
-                was, now = f"{first.width}x{first.height}", f"{frame.width}x{frame.height}"
-                raise ValueError(f"{source}: frames must have one size; got {was}, then {now}")
             end = max(end, frame.time + float(1 / _rate(stream)) - begin)
             old, made = frame.reformat(format="yuv420p"), require().VideoFrame(new.width, new.height, "yuv420p")
             for plane, pixels, target_pixels in zip(warps, _planes(old), _planes(made), strict=True):
@@ -177,10 +174,9 @@ def remake(
     return facts | {"frames": count}
 
 
-def _planes(frame: Any) -> Iterator[np.ndarray[Any, Any]]:
-    """Yield the planes (H, W) of a frame, brightness and two colours at half the resolution; they share its memory."""
-    for plane in frame.planes:
-        yield np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
+def _planes(frame: Any) -> list[np.ndarray[Any, Any]]:
+    """Return the planes (H, W) of a frame, brightness and two colours at half the resolution; they share its memory."""
+    return [np.frombuffer(p, np.uint8).reshape(-1, p.line_size)[: p.height, : p.width] for p in frame.planes]
 
 
 def _halved(camera: Camera) -> Camera:
@@ -220,6 +216,5 @@ def _copied_stream(output: Any, other: Any, source: Path, target: Path) -> Any:
     except ValueError:
         kind = f"{other.type}, {other.codec_context.name}"
         raise ValueError(f"{source}: streams must fit in {target.suffix}; got {kind}. .mkv takes nearly all") from None
-    if "language" in other.metadata:
-        copy.metadata["language"] = other.metadata["language"]
+    copy.metadata.update((key, value) for key, value in other.metadata.items() if key == "language")
     return copy

@@ -61,9 +61,8 @@ def made_of(kind: type[Made], d: Mapping[str, Any]) -> Made:
     record = Record(f"{kind.__name__}.from_dict", plain(d))
     is_camera = issubclass(kind, Camera)
     known = _OF_CAMERAS if is_camera else _OF_POSES
-    for key in record.keys():  # noqa: SIM118
-        if key not in known:
-            record[key].fail(f"keys must be among {', '.join(known)}; got {key!r:.60}")
+    if other := [key for key in record.keys() if key not in known]:  # noqa: SIM118
+        record[other[0]].fail(f"keys must be among {', '.join(known)}; got {other[0]!r:.60}")
     made: Any = _camera(record) if is_camera else _pose(*_vectors(record))
     if not isinstance(made, kind):
         record["model"].fail(f"must be of {kind.__name__}; got {type(made).__name__}. ct.Camera.from_dict takes any")
@@ -138,10 +137,8 @@ def render(rig: Rig, lossy: Lossy) -> str:
 def dict_of(one: Camera | Extrinsics) -> dict[str, Any]:
     """Return a camera or a pose as entries of a file, with its dtype if that is not float64."""
     owner = f"{type(one).__name__}.to_dict"
-    if isinstance(one, Camera) and one.is_mixed:
-        raise TypeError(f"{owner}: camera must be of one model; got a Mixed. Write [c.to_dict() for c in mixed]")
-    if isinstance(one, Camera) and not one.key:
-        raise TypeError(f"{owner}: the model must have a key; got {type(one).__name__} without one")
+    if isinstance(one, Camera) and not one.key:  # as of a Mixed
+        raise TypeError(f"{owner}: camera must be of one model with a key; got {type(one).__name__}")
     entry = _entry(one, Lossy(owner, NAMES.title), "numbers")
     dtype = str(functools.reduce(torch.promote_types, [getattr(one, name).dtype for name in one.tensor_names]))
     return entry if dtype == "torch.float64" else {**entry, "dtype": dtype.removeprefix("torch.")}

@@ -61,16 +61,20 @@ def _camera(record: Record) -> Camera:
 
 def _extrinsics(record: Record, names: list[str]) -> dict[str, Extrinsics]:
     if any("T_cam_imu" in record[name] for name in names):
-        return {name: poses.from_rows(record[name]["T_cam_imu"]) for name in names}
+        return {name: _pose(record[name]["T_cam_imu"]) for name in names}
     if any("T_imu_cam" in record[name] for name in names):
-        return {name: poses.from_rows(record[name]["T_imu_cam"], undo=True) for name in names}
+        return {name: _pose(record[name]["T_imu_cam"], undo=True) for name in names}
     if not any("T_cn_cnm1" in record[name] for name in names[1:]):
         return {}
     chain = {names[0]: poses.pose(record, [0.0] * 3, [0.0] * 3)}
     for previous, name in itertools.pairwise(names):
         with torch.no_grad():
-            chain[name] = poses.from_rows(record[name]["T_cn_cnm1"]).compose(chain[previous])
+            chain[name] = _pose(record[name]["T_cn_cnm1"]).compose(chain[previous])
     return chain
+
+
+def _pose(record: Record, undo: bool = False) -> Extrinsics:
+    return poses.from_matrices(record, poses.rows_of(record), undo)
 
 
 def render(rig: Rig, lossy: Lossy) -> str:

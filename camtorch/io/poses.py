@@ -74,11 +74,6 @@ def rows_of(record: Record) -> list[list[float]]:
     return [*rows[:3], [0.0, 0.0, 0.0, 1.0]]
 
 
-def from_rows(record: Record, undo: bool = False) -> Extrinsics:
-    """Return the pose of a 4 x 4 or 3 x 4 matrix."""
-    return from_matrices(record, rows_of(record), undo)
-
-
 def from_quaternions(place: Place, values: Any, undo: bool = False) -> Extrinsics:
     """Return the pose of (*B, 7): unit quaternions w, x, y, z and translations."""
     quaternions, translations = as_float64(values).tensor_split([4], -1)

@@ -38,7 +38,7 @@ def test_show_writes_a_page(folder, capsys):
     whole = Path("in.png").read_bytes()
     huge = whole[:16] + 2 * (60_000).to_bytes(4, "big") + whole[24:29]  # of a bomb; what comes next is not read
     huge += zlib.crc32(huge[12:]).to_bytes(4, "big") + whole[33:]
-    for content, reason in ((b"no image", "must be an image"), (whole[:-40], "truncated"), (huge, "million")):
+    for content, reason in ((b"no image", "cannot identify"), (whole[:-40], "truncated"), (huge, "exceeds limit")):
         Path("broken.png").write_bytes(content)
         error = refused(capsys, "show", "camera.yml", "--html", "b.html", "--image", "broken.png")
         assert "broken.png: " in error

@@ -146,7 +146,7 @@ REFUSED = [
     ([*WORDS[:-1], "out.webm", "--codec", "libx264"], "'libx264' codec. Choose another encoder with --codec"),
     ([*WORDS[:-1], "out.png"], "out.png: the suffix of the video must be one of .mp4, .m4v"),
     ([*WORDS[:-1], "in.mkv", "--force"], "in.mkv: would overwrite in.mkv, which is read"),
-    (["dewarp", "none.mkv", *WORDS[2:]], "none.mkv: no such file"),
+    (["dewarp", "none.mkv", *WORDS[2:]], "none.mkv: No such file"),
 ]
 
 

@@ -167,7 +167,7 @@ def spelled(content):
         ("a.p", pickle.dumps({"K": [1]}), r"byte 0: must be text, or an archive as of numpy\.savez.* got other bytes"),
         ("cameras.bin", GIGANTIC, "byte 0: must have as many cameras as .* got 1152921504606846976"),
         ("cameras.bin", struct.pack("<QIiQQ", 1, 1, 99, 4, 4), "byte 8: the model must be one of .* got 99"),
-        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, math.nan, 1), "must be finite"),
+        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, math.nan, 1), "must be a finite number"),
         ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 1 << 60, 4, 1, 1, 1, 1), "must be a number of pixels"),
         ("cameras.bin", BINARY + b"x", "must end after the last camera"),
         ("images.txt", b"\xff\xfe\n", "line 1: must be text"),
