@@ -80,7 +80,6 @@ def _map(commands: Commands) -> None:
     file = command.add_argument_group("the map").add_argument
     file("--format", help="opencv, opencv_fixed, dw100, ti_ldc or onnx; by default as OUT ends")
     file("--step", type=int, metavar="PIXELS", help="ti_ldc: between nodes; 8 by default")
-    file("--block", type=words.size, metavar="WxH", help="ti_ldc: of the new image; by default what fits")
     file("--dtype", choices=("float32", "uint8"), help="onnx: of images; float32 by default")
     file("--clip", action="store_true", default=None, help="dw100, ti_ldc: clip positions that they cannot hold")
     file("--check", type=words.path, metavar="MAP", help="write nothing; print how far this map is from the dewarping")

@@ -7,11 +7,13 @@ from pathlib import Path
 
 from camtorch.cli import targets
 from camtorch.cli.cameras import read_camera
-from camtorch.maps.formats import check_map, files_of, save_map
+from camtorch.maps.formats import files_of, load_map, save_map
+from camtorch.maps.lookup import Exact
+from camtorch.maps.report import measure
 from camtorch.warp.dewarp import Dewarp
 from camtorch.warp.warp import Warp
 
-_OPTIONS = ("step", "block", "dtype", "clip")
+_OPTIONS = ("step", "dtype", "clip")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -24,7 +26,8 @@ def run(arguments: argparse.Namespace) -> None:
             targets.check(Path(name), force=arguments.force, inputs=(arguments.camera, arguments.target))
     warp = _warp(arguments)
     if output is None:
-        print(check_map(warp, arguments.check, arguments.format))
+        read = load_map(arguments.check, arguments.format)
+        print(measure(str(arguments.check), read, Exact(warp, "--check"), (), read.facts))
     else:
         output.parent.mkdir(parents=True, exist_ok=True)
         print(save_map(warp, output, arguments.format, **{name: getattr(arguments, name) for name in _OPTIONS}))

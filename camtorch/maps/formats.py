@@ -37,7 +37,6 @@ class MapOptions(TypedDict, total=False):
     """Options of `save_map`, each for some formats."""
 
     step: int | None
-    block: tuple[int, int] | None
     dtype: Literal["float32", "uint8"] | None
     clip: bool | None
 
@@ -57,7 +56,6 @@ def save_map(
         format: "opencv" (.yml, .npz), "opencv_fixed" (the same), "dw100", "ti_ldc" or "onnx". Default: chosen by
             the suffix.
         step: "ti_ldc": pixels of the target between the nodes of the mesh, a power of two up to 128; 8 by default.
-        block: "ti_ldc": (height, width) of the blocks of the target; default the largest possible.
         dtype: "onnx": of the images, "float32" by default, or "uint8".
         clip: "dw100", "ti_ldc": clip positions that the format cannot hold, instead of refusing them.
 
@@ -136,22 +134,14 @@ def files_of(path: str | os.PathLike[str], format: str | None = None) -> tuple[s
     return (name, f"{name}.json") if _chosen(name, format).described else (name,)
 
 
-def check_map(warp: Warp, path: str | os.PathLike[str], format: str | None = None) -> MapReport:
-    """Return the report on the error of an existing map; raise as `load_map`, and if the sizes differ."""
-    read = load_map(path, format)
-    return measure(path_of(path, "check_map"), read, Exact(warp, "check_map"), (), read.facts)
-
-
 def _read_description(path: str) -> dict[str, Any]:
     """Return the description of a bare table, or an empty dict."""
     if not os.path.isfile(beside := f"{path}.json"):
         return {}
-    with open(beside, "rb") as file:
-        content = file.read(_LARGEST_DESCRIPTION + 1)
     try:
-        described = json.loads(content)
-        if not isinstance(described, dict) or len(content) > _LARGEST_DESCRIPTION:
-            raise ValueError("must be a short mapping; got another value")
+        described = json.loads(read_bytes(beside, _LARGEST_DESCRIPTION))
+        if not isinstance(described, dict):
+            raise ValueError("must be a mapping; got another value")
     except (ValueError, RecursionError) as error:
         raise CameraFileError(beside, "content", f"must describe a map: {error}") from None
     return described

@@ -33,12 +33,7 @@ class MapReport:
     files: tuple[str, ...]
     """Written files: the map, and for a bare table its description."""
     facts: dict[str, Any]
-    """Other facts that a user of the map needs, such as `step`, `nodes` or `block_size`."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name in (facts := self.__dict__.get("facts", {})):  # a fact is an attribute
-            return facts[name]
-        raise AttributeError(f"MapReport of {self.__dict__.get('format')} has no {name!r}; it has {', '.join(facts)}")
+    """Other facts that a user of the map needs by name, such as "step", "nodes" or "block_size"."""
 
     def __str__(self) -> str:
         """Return one line, as the command line prints it."""

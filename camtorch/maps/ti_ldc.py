@@ -6,8 +6,7 @@ bilinearly and draws positions in to the image.
 
 It makes the target block by block, and fetches for each the part of the source around what the block's corners say,
 with a padding that software has to state so that all pixels of the block find what they need. Both are reported: the
-largest of the usual block sizes whose padding the register holds, or that asked for, and the padding, for the bicubic
-filter. Widths of blocks are multiples of 8, heights even.
+largest of the usual block sizes whose padding the register holds, and the padding, for the bicubic filter.
 
 Technical reference manuals, e.g. SPRUJ28, "LDC Lens Distortion Back-Mapping" and "LDC Input Block Fetch".
 """
@@ -23,7 +22,6 @@ import numpy as np
 from camtorch.io.record import CameraFileError
 from camtorch.maps.lookup import Exact, Floats
 from camtorch.maps.mesh import Mesh, Table, held, rounded, table
-from camtorch.values.arguments import as_image_size
 
 _PARTS = 8
 _LOW, _HIGH = -(1 << 15), (1 << 15) - 1
@@ -32,25 +30,18 @@ _LARGEST = 8192  # pixels along a side
 _BLOCKS = ((64, 64), (32, 64), (32, 32), (16, 32), (16, 16), (8, 16), (8, 8), (4, 8), (2, 8))  # height, width
 _MOST_PADDING = 15  # four bits
 _BEFORE, _AFTER = 1, 2  # pixels around the whole part of a position that a bicubic filter reads
-_LONGEST_BLOCK = 255  # eight bits
 
 
 class TILDC(Table):
     """The format of TI's LDC; see the module."""
 
     name = "ti_ldc"
-    options: tuple[str, ...] = ("step", "block", "clip")
+    options: tuple[str, ...] = ("step", "clip")
     step = 8
     steps: tuple[int, ...] = tuple(1 << m for m in range(8))
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
         """Return the file of a mesh and its facts; raise a CameraFileError if the LDC does not support them."""
-        block = as_image_size(options.get("block"), "save_map", "block")
-        if block is not None and (block[1] % 8 or block[0] % 2 or not all(0 < s <= _LONGEST_BLOCK for s in block)):
-            raise ValueError(
-                "save_map: block=(height, width) must be of an even height and a width that is a multiple of 8, each "
-                f"at most {_LONGEST_BLOCK}; got {block}"
-            )
         if max(*exact.source_size, *exact.target_size) > _LARGEST:
             raise CameraFileError(path, "size", f"sides must be at most {_LARGEST} px for the LDC; got more")
         (n, m), places = mesh.nodes.shape[:2], mesh.places
@@ -60,7 +51,7 @@ class TILDC(Table):
         lines = np.zeros((n, _pitch(m) // 2), "<i2")
         lines[:, : 2 * m] = (parts - places * _PARTS).reshape(n, -1)
         positions = replace(mesh, nodes=parts / _PARTS).positions(exact.target_size)
-        size, padding, largest = _fetched(path, positions, exact.source_size, block)
+        size, padding, largest = _fetched(path, positions, exact.source_size)
         facts = {"line_offset": _pitch(m), "block_size": size, "pixel_padding": padding, "source_block": largest}
         return lines.tobytes(), facts
 
@@ -75,12 +66,10 @@ def _pitch(columns: int) -> int:
     return -(-4 * columns // _ALIGNED) * _ALIGNED
 
 
-def _fetched(
-    path: str, positions: Floats, source: tuple[int, int], block: tuple[int, int] | None
-) -> tuple[tuple[int, int], int, tuple[int, int]]:
+def _fetched(path: str, positions: Floats, source: tuple[int, int]) -> tuple[tuple[int, int], int, tuple[int, int]]:
     """Return block size, padding and the largest part of the source that is fetched; raise if no block fits."""
     drawn = positions.clip(0, np.array(source[::-1], np.float64) - 1)
-    for size in _BLOCKS if block is None else (block,):
+    for size in _BLOCKS:
         height, width = drawn.shape[:2]
         rows, columns = -(-height // size[0]), -(-width // size[1])
         whole = np.pad(drawn, ((0, rows * size[0] - height), (0, columns * size[1] - width), (0, 0)), "edge")
@@ -97,5 +86,5 @@ def _fetched(
         path,
         "pixel padding",
         f"blocks of {size[1]}x{size[0]} must need at most {_MOST_PADDING} pixels around their corners' positions; got "
-        f"{padding}{'' if block is None else '. Smaller blocks need less'}",
+        f"{padding}",
     )

@@ -238,8 +238,6 @@ REFUSED = [
     (small, "dw100", {"step": 8}, "options of dw100 must be among clip; got step"),
     (small, "ti_ldc", {"step": 8.0}, r"step must be a whole number; got 8.0"),
     (small, "ti_ldc", {"step": 12}, "step must be one of"),
-    (small, "ti_ldc", {"block": 32}, r"save_map: block must be two integers \(height, width\); got 32"),
-    (small, "ti_ldc", {"block": (8, 12)}, "multiple of 8"),
 ]
 
 
@@ -259,18 +257,21 @@ def test_what_clipping_costs_is_told_and_other_formats_need_none(tmp_path):
     assert ct.save_map(across_the_seam(), tmp_path / "map.npz").max_error < 1e-4
 
 
-@pytest.mark.parametrize("block", [None, (8, 32)])
-def test_blocks_with_their_padding_hold_what_they_need(block, tmp_path):
-    warp = ct.Dewarp(fisheye(0.25), projection="equirectangular", image_size=(90, 160))
-    report = ct.save_map(warp, tmp_path / "map.bin", "ti_ldc", block=block)
-    (height, width), padding = report.block_size, report.pixel_padding
-    assert block in (None, (height, width))
-    assert width % 8 == 0
-    assert height % 2 == 0
+def up_to_the_pole():
+    upwards = ct.augment.mount_rotation(*torch.tensor([0.0, 90.0, 0.0], dtype=torch.float64))
+    return ct.Warp(fisheye(0.25), ct.Equirectangular.from_fov(360, image_size=(80, 160)).double(), upwards)
+
+
+@pytest.mark.parametrize(("make", "size"), [(small, None), (up_to_the_pole, (32, 32))])
+def test_blocks_with_their_padding_hold_what_they_need(make, size, tmp_path):
+    warp = make()
+    facts = ct.save_map(warp, tmp_path / "map.bin", "ti_ldc").facts
+    (height, width), padding = facts["block_size"], facts["pixel_padding"]
+    assert size in (None, (height, width))
     found = ct.load_map(tmp_path / "map.bin").positions.numpy().clip(0, (319, 199))
     needed, largest = 0, np.zeros(2)
-    for top in range(0, 90, height):
-        for left in range(0, 160, width):
+    for top in range(0, len(found), height):
+        for left in range(0, found.shape[1], width):
             part = found[top : top + height, left : left + width]
             corners = np.stack((part[0, 0], part[0, -1], part[-1, 0], part[-1, -1]))
             first, last = np.floor(corners.min(0)), np.ceil(corners.max(0))
@@ -279,17 +280,7 @@ def test_blocks_with_their_padding_hold_what_they_need(block, tmp_path):
                 needed = max(needed, *(first - reads[0]), *(reads[1] - last))
             largest = np.maximum(largest, last - first + 1)
     assert padding == needed
-    assert report.source_block == tuple((largest[::-1] + 2 * padding).astype(int))
-
-
-def test_blocks_that_need_more_padding_than_there_is_are_refused(tmp_path):
-    lens = ct.KannalaBrandt([60.0, 60, 319.5, 239.5], [0.0] * 4, image_size=(480, 640)).double()
-    wide = ct.Warp(lens, ct.Pinhole([10.0, 10, 63.5, 63.5], image_size=(128, 128)).double(), tolerance=0)
-    with pytest.raises(ct.CameraFileError, match=r"blocks of 128x128 must need .* Smaller blocks"):
-        ct.save_map(wide, tmp_path / "map.bin", "ti_ldc", block=(128, 128))
-    report = ct.save_map(wide, tmp_path / "map.bin", "ti_ldc")
-    assert report.block_size[0] <= 64
-    assert report.pixel_padding <= 15
+    assert facts["source_block"] == tuple((largest[::-1] + 2 * padding).astype(int))
 
 
 def test_the_name_says_the_format_or_the_error_lists_them(tmp_path):
@@ -341,7 +332,7 @@ def test_bare_tables_have_a_description(tmp_path):
     report = ct.save_map(small(), tmp_path / "map.bin", "ti_ldc", step=16)
     described = json.loads((tmp_path / "map.bin.json").read_text())
     assert described["format"] == "ti_ldc"
-    assert described["block_size"] == list(report.block_size)
+    assert described["block_size"] == list(report.facts["block_size"])
     assert report.files == (str(tmp_path / "map.bin"), str(tmp_path / "map.bin.json"))
     with pytest.raises(ct.CameraFileError, match="must be dw100; got 'ti_ldc'"):
         ct.load_map(tmp_path / "map.bin", "dw100")
@@ -397,10 +388,10 @@ def test_spoiled_descriptions_are_one_kind_of_error(content, tmp_path):
 def test_the_command_writes_a_map_and_measures_one(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     ct.save(fisheye(0.25), "camera.json")
-    assert main(["map", "camera.json", "-o", "maps/ti.bin", "--format", "ti_ldc", "--block", "32x16"]) == 0
+    assert main(["map", "camera.json", "-o", "maps/ti.bin", "--format", "ti_ldc"]) == 0
     told = capsys.readouterr().out
     assert told.startswith("maps/ti.bin: ti_ldc, 320x200 from 320x200, off by at most 0.")
-    assert "block size 32x16; pixel padding 2" in told
+    assert "block size 64x64; pixel padding " in told
     assert main(["map", "camera.json", "--check", "maps/ti.bin"]) == 0
     assert capsys.readouterr().out.split(";")[0] == told.split(";")[0]
     assert main(["map", "camera.json", "--fov", "60", "--check", "maps/ti.bin"]) == 0
