@@ -72,8 +72,10 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
     if isinstance(cameras, (list, tuple)) and all(isinstance(camera, Camera) for camera in cameras):
         cameras = collate_cameras(cameras)
     if not isinstance(cameras, Camera) or cameras.is_mixed:
+        got = [type(one).__name__ for one in cameras] if isinstance(cameras, list) else type(cameras).__name__
         raise TypeError(
-            f"with_cameras: cameras must be a batch, or a list, of one model and size; got {type(cameras).__name__}"
+            "with_cameras: cameras must be a Camera with a batch dim, or single ones of one model and size, in a list; "
+            f"got {got}"
         )
     result: Any = pytree.tree_map(lambda value: value, params)
     found = [own for _, own in _parts(result) if KIND in own]

@@ -16,6 +16,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.evaluate.known import known_false
 from camtorch.poses.rotations import check_rotation, rotation_matrix
 from camtorch.values.arguments import as_known_size, as_number, no_camera, shown
+from camtorch.values.module import typed_as
 from camtorch.warp.views import pinhole
 from camtorch.warp.warp import Warp
 
@@ -178,7 +179,9 @@ class FaceNormalizer(SampleTransform):
         return moved
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def extra_repr(self) -> str:
         """Return the numbers of the virtual camera, and the options."""

@@ -28,7 +28,7 @@ from camtorch.projection.unproject import UNPROJECT
 from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
 from camtorch.rays.lattices import field_of_view
 from camtorch.values.arguments import Numbers, broadcast_shapes, hinting, warn
-from camtorch.values.module import GeometryModule
+from camtorch.values.module import GeometryModule, typed_as
 
 Model = TypeVar("Model", bound="Camera", default="Camera")
 
@@ -300,7 +300,9 @@ class Camera(Freezable, Editable):
         return self.project(points)
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def project(self, points: Numbers) -> tuple[Tensor, Tensor]:
         """Project points, or rays, of the camera frame to pixels.

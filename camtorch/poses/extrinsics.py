@@ -26,7 +26,7 @@ from camtorch.values.arguments import (
     hinting,
     shown,
 )
-from camtorch.values.module import BatchedModule, learning_as, remade
+from camtorch.values.module import BatchedModule, learning_as, remade, typed_as
 
 
 class Extrinsics(BatchedModule):
@@ -93,7 +93,9 @@ class Extrinsics(BatchedModule):
         return restore(turned + translation.mT.unsqueeze(-1))
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def matrix(self) -> Tensor:
         """Return the matrices (*B, 4, 4) [[R, t], [0, 1]]."""

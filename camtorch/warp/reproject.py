@@ -14,7 +14,7 @@ from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix
 from camtorch.rays.depth import as_depth, depth_scale
 from camtorch.values.arguments import Numbers, check_devices, one_of
-from camtorch.values.module import GeometryModule
+from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.panorama import off_poles, seam_of
 from camtorch.warp.proxy import beside, check_pose, turned
@@ -127,7 +127,9 @@ class Reproject(GeometryModule):
         return result.unflatten(2, (steps, -1)), valid
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def _seen(self, depth: Tensor, kind: str) -> tuple[Tensor, Tensor]:
         """Return source pixels (B, D, H', W', 2), and whether they are valid."""

@@ -26,7 +26,7 @@ from camtorch.values.arguments import (
     shown,
 )
 from camtorch.values.dtypes import narrow, widen
-from camtorch.values.module import GeometryModule, remade
+from camtorch.values.module import GeometryModule, remade, typed_as
 from camtorch.warp.boxes import corners_of
 from camtorch.warp.warp import Warp, as_sized
 
@@ -75,7 +75,9 @@ class Views(GeometryModule):
         return np.stack(views, int(images.ndim == 4)) if isinstance(images, np.ndarray) else views
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def valid_masks(self) -> Tensor:
         """Return (1, N, 1, S, S) bool: whether the camera sees each pixel of the views."""

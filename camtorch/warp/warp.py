@@ -23,6 +23,7 @@ from camtorch.values.arguments import (
     no_camera,
     one_of,
 )
+from camtorch.values.module import typed_as
 from camtorch.warp import plan
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
@@ -183,7 +184,9 @@ class Warp(CameraPair):
         return plan.warped(self, images, sampler)
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def strips(
         self,
