@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from camtorch.boards.boards import Board, as_board, opencv
@@ -56,8 +55,8 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
     board, unreadable ones, and those of a rarer size are left out; one warning names them. It needs OpenCV.
 
     Args:
-        images: A path, a folder, a pattern such as "photos/*.jpg", or a list of these; an array (H, W) or (H, W, C) or
-            a tensor (C, H, W), uint8 or uint16, a stack or a list of them; Pillow images.
+        images: A path, a folder, a pattern such as "photos/*.jpg", or a list of these; an array (H, W) or (H, W, C),
+            uint8 or uint16, a stack or a list of them; Pillow images.
         board: "9x6" or (9, 6), inner corners of a chessboard; "charuco 5x7", squares; "aprilgrid 6x6", tags.
         square: The side of a square, or of a tag, in the unit of the poses.
         options: `marker`, `dictionary`, `legacy` of ChArUco; `spacing`, `border`, `dictionary` of an AprilGrid.
@@ -105,7 +104,7 @@ def search(board: Board, images: Sequence[Image], done: Callable[[], object] = l
 
 def _search(board: Board, path: Path, grey: NDArray[Any] | None) -> ImageCorners:
     try:
-        grey = _grey_of(read_stored(path)[0], _RGB) if grey is None else grey
+        grey = _grey_of(read_stored(path)[0].permute(1, 2, 0).numpy(), _RGB) if grey is None else grey
     except (ValueError, OSError) as error:
         why = " ".join((getattr(error, "strerror", None) or str(error)).removeprefix(f"{path}: ").split())
         return ImageCorners(path, (0, 0), np.full((len(board.points()), 2), np.nan), why)
@@ -147,40 +146,34 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
 
 
 def _as_images(images: Any) -> list[Image]:
-    if isinstance(images, (str, os.PathLike)):
+    is_one = isinstance(images, np.ndarray) and (images.ndim == 2 or (images.ndim == 3 and _has_channels(images)))
+    if isinstance(images, (str, os.PathLike)) or is_one:
         images = [images]
-    elif isinstance(images, (np.ndarray, torch.Tensor)):
-        images = [images] if images.ndim == 2 or (images.ndim == 3 and _has_channels(images)) else list(images)
-    if not isinstance(images, Sequence):
+    if not isinstance(images, (Sequence, np.ndarray)):
         raise TypeError(f"{_OWNER}: images must be paths or arrays; got {shown(images)}")
-    if not images:
+    if not len(images):
         raise ValueError(f"{_OWNER}: images must not be empty; got none")
     given: list[Image] = []
     for i, one in enumerate(images):
         if isinstance(one, (str, os.PathLike)):
             given += [(path, None) for path in gather([os.fspath(one)])]
-        elif isinstance(one, torch.Tensor) or hasattr(one, "__array_interface__"):  # like Pillow's images
-            array = one if isinstance(one, torch.Tensor) else np.asarray(one)
-            given.append((Path(f"image {i}"), _grey_of(array, _EITHER_WAY, f"images[{i}]")))
+        elif hasattr(one, "__array_interface__"):  # like Pillow's images
+            given.append((Path(f"image {i}"), _grey_of(np.asarray(one), _EITHER_WAY, f"images[{i}]")))
         else:
-            raise TypeError(f"{_OWNER}: images[{i}] must be a path or an array; got {shown(one)}")
+            raise TypeError(f"{_OWNER}: images[{i}] must be a path or an array (H, W, C); got {shown(one)}")
     return given
 
 
-def _has_channels(image: Any) -> bool:
-    return image.shape[0 if isinstance(image, torch.Tensor) else -1] in (1, 2, 3, 4)
+def _has_channels(image: NDArray[Any]) -> bool:
+    return image.shape[-1] in (1, 2, 3, 4)
 
 
-def _grey_of(image: Any, weights: Sequence[float], name: str = "image") -> NDArray[Any]:
-    """Return the grey values (H, W) of an array (H, W, C) or a tensor (C, H, W), colours by their weights."""
-    array = image.detach().cpu().numpy() if isinstance(image, torch.Tensor) else image
-    if array.ndim not in (2, 3) or (array.ndim == 3 and not _has_channels(image)) or not array.size:
-        forms = "an array (H, W) or (H, W, C), or a tensor (C, H, W)"
-        raise ValueError(f"{_OWNER}: {name} must be {forms}; got {tuple(image.shape)}")
-    if array.ndim == 3 and isinstance(image, torch.Tensor):
-        array = np.moveaxis(array, 0, -1)
-    if array.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{_OWNER}: {name} must be uint8 or uint16; got {array.dtype}")
+def _grey_of(array: NDArray[Any], weights: Sequence[float], name: str = "image") -> NDArray[Any]:
+    """Return the grey values (H, W) of an array (H, W) or (H, W, C), colours by their weights."""
+    is_image = array.ndim == 2 or (array.ndim == 3 and _has_channels(array))
+    if not is_image or not array.size or array.dtype not in (np.uint8, np.uint16):
+        got = f"{array.dtype} of shape {array.shape}"
+        raise ValueError(f"{_OWNER}: {name} must be uint8 or uint16, (H, W) or (H, W, C); got {got}")
     if array.ndim == 3 and array.shape[-1] > 2:
         array = np.rint(array[..., :3].astype(np.float32) @ np.array(weights, np.float32)).astype(array.dtype)
     return np.ascontiguousarray(array if array.ndim == 2 else array[..., 0])

@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-import torch
 from photographs import fisheye, photograph
 from PIL import Image
 
@@ -197,9 +196,9 @@ SMALL = fisheye().resize(240, 320)
     [
         lambda image: image,
         lambda image: np.stack([image] * 3, -1),
-        lambda image: [torch.from_numpy(image)[None]],
+        lambda image: [image[..., None]],
         lambda image: [Image.fromarray(image).convert("RGB")],
-        lambda image: torch.from_numpy(image)[None, None],
+        lambda image: image[None],
         lambda image: image.astype(np.uint16) * 257,
     ],
 )
@@ -215,8 +214,7 @@ def test_one_image_in_any_form(form):
     [
         (np.zeros((80, 80), np.uint8), "9by6", ValueError, "charuco 5x7"),
         (np.zeros((80, 80), np.uint8), "9x6", ValueError, "got 1 without. image 0: no board found"),
-        (np.zeros((80, 80)), "9x6", ValueError, "uint8 or uint16; got float64"),
-        (np.zeros((80, 80), np.int32), "9x6", ValueError, "uint8 or uint16"),
+        (np.zeros((80, 80)), "9x6", ValueError, "uint8 or uint16, .*; got float64"),
         ("nowhere/*.jpg", "9x6", ValueError, "the pattern must match files; got none"),
         ("nowhere.jpg", "9x6", ValueError, "No such file"),
         ([], "9x6", ValueError, "must not be empty"),
