@@ -1,11 +1,12 @@
 """The images of the documentation, rendered: `python docs/make_images.py`, or those of one part, or some of these.
 
 `guides` makes those of the guides, `guides dewarp learn` two of them, `models kannala_brandt` that of one camera model;
-`case-study` takes a quarter of an hour, `viewer` a browser (`pip install -e ".[viewer-test]"`, and Chromium): these are
-made by their names only.
+`case-study` draws the numbers that `examples/train_faces.py` measured, and `viewer` needs a browser (`pip install -e
+".[viewer-test]"`, and Chromium): these are made by their names only.
 """
 
 import io
+import json
 import shutil
 import subprocess
 import sys
@@ -16,8 +17,6 @@ import matplotlib
 
 matplotlib.use("agg")
 
-import matplotlib.pyplot as plt
-import torch
 from PIL import Image
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))  # which have boards, and photographs of them
@@ -28,7 +27,6 @@ from drawings import augmentations, concepts, guides, models, views
 from drawings.pages import EXAMPLES, IMAGES
 
 import camtorch as ct
-from camtorch.plot.axes import COLOURS
 
 SCRIPTS = {
     "room": "dewarp_room",
@@ -48,30 +46,9 @@ def save(image: Image.Image, name: str) -> None:
     image.convert("RGB").save(IMAGES / f"{name}.jpg", quality=70, optimize=True)
 
 
-def case_study(seeds: int = 3) -> None:
-    """What networks find, how they come to it, and the medians over some seeds."""
-    runs, tests = zip(*(train_faces.run(seed=seed) for seed in range(seeds)), strict=True)
-    with tempfile.TemporaryDirectory() as folder:
-        train_faces.draw(runs[0], tests[0], f"{folder}/faces.png")
-        save(Image.open(f"{folder}/faces.png"), "case-study")
-    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for colour, (name, title) in zip(COLOURS, train_faces.TRAINING_SETS.items(), strict=False):
-        curves = torch.tensor([run[name].curves["mounts"] for run in runs])  # (seeds, looks, 3)
-        for j, ax in enumerate(axes):
-            values = curves[..., 1 + j] * (100 if j == 0 else 1)
-            ax.plot(curves[0, :, 0], values.median(0).values, color=colour, label=title)
-            ax.fill_between(curves[0, :, 0], values.amin(0), values.amax(0), color=colour, alpha=0.15, linewidth=0)
-    axes[0].set_title("landmarks, % of the distance between the eyes", fontsize="medium")
-    axes[1].set_title("gaze, degrees", fontsize="medium")
-    axes[1].legend(frameon=False, fontsize="small")
-    for ax, top in zip(axes, (16, 30), strict=True):
-        ax.set_xlabel("steps")
-        ax.set_ylim(0, top)
-        ax.spines[["top", "right"]].set_visible(False)
-    figure.savefig(IMAGES / "case-study-curves.png", dpi=110)
-    for name, title in train_faces.TRAINING_SETS.items():
-        last = torch.tensor([[curve[-1][1:] for curve in run[name].curves.values()] for run in runs])
-        print(f"{title:<28}{last.median(0).values.tolist()}")
+def case_study() -> None:
+    """The errors of the case study, from the file of its numbers."""
+    train_faces.draw(json.loads(train_faces.NUMBERS.read_text()), IMAGES / "case-study.png")
 
 
 def viewer() -> None:

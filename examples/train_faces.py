@@ -1,248 +1,318 @@
-"""Teaches networks by images of one camera to read faces behind others, with and without augmentation (some minutes).
+"""Measures how many images of new cameras one camera's images with augmentation are worth.
 
-They start from the same weights and take as many steps on as many images. They find landmarks in the image
-of a driver's face, and which way the eyes look; those with rays are told beside each face where its corners look. The
-last two learn from images of the other cameras themselves: what augmentation can come near to, and hardly pass.
+Networks find landmarks in images of rendered drivers' faces, and the direction of gaze. Some learn from images of one
+camera, some from 80 to 10,000 images of the cameras of the tests, some from both. They start from the same weights for
+a seed, and take the same number of steps. The script writes the result of each network into a file, reads those that
+the file has, and trains the others; `examples/train_faces.json` has all, so that this only draws them:
 
     python examples/train_faces.py -o faces.png
+
+`--numbers FILE` measures anew (an hour and a half on two cores).
 """
 
 import argparse
-import copy
+import functools
+import json
+import multiprocessing
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+import statistics
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import torch
-import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
-from kornia.augmentation import RandomAffine
-from scenes import cabin, faces
-from scenes.faces import NAMES, SIDE, Photographs, Samples
-from torch import Tensor, nn
+from scenes import cabin, crops, faces
+from scenes.faces import Samples
+from scenes.reader import Network, loss_of, medians
 
 import camtorch as ct
+from camtorch.plot.axes import COLOURS
 
-TRAINING_SETS = {
-    "plain": "one camera's images",
-    "plain_rays": "... and rays",
-    "affine": "... with RandomAffine",
-    "camtorch": "... with camtorch",
-    "camtorch_rays": "... with camtorch and rays",
-    "own": "the other cameras' own images",
-    "own_rays": "... and rays",
+NUMBERS = Path(__file__).with_suffix(".json")
+
+
+class Contestant(NamedTuple):
+    """The images that a network learns from."""
+
+    title: str
+    one: int = 0
+    """How many images of one camera."""
+    augmentation: str = "camtorch"
+    """Of these images, a key of `crops.AUGMENTATIONS`."""
+    own: int = 0
+    """How many images of the cameras of the tests."""
+    rays: bool = True
+    """Whether the network receives the rays of the corners of each crop."""
+
+
+CONTESTANTS = {
+    "own 80": Contestant("80 of the new cameras' own", own=80),
+    "own 400": Contestant("400 of the new cameras' own", own=400),
+    "own 2000": Contestant("2,000 of the new cameras' own", own=2000),
+    "own 10000": Contestant("10,000 of the new cameras' own", own=10000),
+    "camtorch": Contestant("400 of one camera with camtorch", 400),
+    "camtorch 2000": Contestant("2,000 of one camera with camtorch", 2000),
+    "both 80": Contestant("400 of one camera with camtorch, 80 own", 400, own=80),
+    "both 400": Contestant("400 of one camera with camtorch, 400 own", 400, own=400),
+    "both 2000": Contestant("400 of one camera with camtorch, 2,000 own", 400, own=2000),
+    "plain": Contestant("400 of one camera", 400, "plain"),
+    "affine, no rays": Contestant("400 of one camera with RandomAffine, no rays", 400, "affine", rays=False),
+    "camtorch, no rays": Contestant("400 of one camera with camtorch, no rays", 400, rays=False),
+    "box, no rays": Contestant("400 of one camera with camtorch and BoxCrop, no rays", 400, "box", rays=False),
 }
-TESTS = {"seen": "the same camera", "mounts": "other lenses and mounts", "shutter": "... and rolling shutters"}
-YAW, PITCH, ROLL = 35.0, 20.0, 25.0  # degrees, wider than those of the tests: nobody knows the mounts to come
-LOOKS = 50  # steps between two looks at the tests
-Augment = Callable[[Photographs, Tensor, torch.Generator], Samples]
+TESTS = {
+    "seen": "the same camera",
+    "mounts": "new lenses and mounts",
+    "shutter": "new, rolling shutters",
+    "lens": "a lens outside",
+    "mount": "mounts outside",
+}
+OUTSIDE_FOV, OUTSIDE_MOUNTS = 175.0, ((36.0, 45.0), (21.0, 25.0), (0.0, 20.0))
+BATCH = 32
+CHUNK = 250  # images that a process renders at a time
+VIEWS = {"own": 8, "plain": 8, "affine": 16, "camtorch": 32, "box": 16}  # of each image
+OWN_WIDER = 1.25  # squares kept of images that nothing turns
 
 
-# -- what is learned from: faces of the photographs that a tensor numbers
+# -- crops to learn from and to test with, made once for all seeds
 
 
-def plain(seen: Photographs, index: Tensor, generator: torch.Generator) -> Samples:
-    """Faces cut out somewhat larger or smaller, and beside."""
-    pixels, valid = seen.camera.project(seen.points[index])
-    near, whole = faces.cut(seen.camera, pixels, valid, 2 * torch.rand(len(index), 3, generator=generator) - 1)
-    return warped(seen, index, ct.Warp(seen.camera, near, padding_mode="border"), whole)
+class Data(NamedTuple):
+    """Crops of faces."""
+
+    learned: dict[str, Samples]
+    """"own", and by `crops.AUGMENTATIONS` those of one camera: several views (V, N, ...) of each of N images."""
+    tests: dict[str, dict[str, Samples]]
+    """"plain" and "box" crops of other drivers, by `TESTS`."""
 
 
-def by_camera(seen: Photographs, index: Tensor, generator: torch.Generator) -> Samples:
-    """Real lenses, mounted anywhere and turning, of whose images the faces are cut: one warp from the first to the cut.
-
-    What it needs beyond `RandomCamera` is that the cut follows the face.
-    """
-    augment = ct.augment.RandomCamera("real", fov=(60, 160), yaw=YAW, pitch=PITCH, roll=ROLL, crop=None, min_filled=0)
-    change = augment.change(seen.camera, augment.draw(len(index), generator))
-    assert isinstance(change.target, ct.Camera)
-    return cut_out(seen, index, change.target, change.rotation, generator)
-
-
-def as_taken(seen: Photographs, index: Tensor, generator: torch.Generator) -> Samples:
-    """Faces of the images as they are, cut out, and a rolling shutter."""
-    turn = torch.eye(3, dtype=torch.float64).expand(len(index), 3, 3)
-    return cut_out(seen, index, seen.camera, turn, generator)
-
-
-def cut_out(seen: Photographs, index: Tensor, camera: ct.Camera, turn: Tensor, generator: torch.Generator) -> Samples:
-    """Faces as `camera`, one or one of each, sees them when it is turned and its shutter rolls, cut out at random."""
-    jitter, rates = (2 * torch.rand(2, len(index), 3, generator=generator) - 1).unbind()
-    near, whole = faces.cut(camera, *camera.project(seen.points[index].to(turn) @ turn.mT), jitter)
-    readout = SIDE * faces.READOUT / faces.SIZE[0] * camera.fx / near.fx
-    shutter = ct.RollingShutter(readout, faces.RATE * rates)
-    warp = ct.ShutterWarp(seen.camera, near, turn, target_shutter=shutter, padding_mode="border")
-    return warped(seen, index, warp, whole)
-
-
-def by_affine(seen: Photographs, index: Tensor, generator: torch.Generator) -> Samples:
-    """Turns cut faces by as much as `by_camera` rolls, and scales, shears and shifts them."""
-    augment = RandomAffine(ROLL, (0.05, 0.05), (0.85, 1.15), (-8.0, 8.0), p=1.0, padding_mode="border")
-    cut = plain(seen, index, generator)
-    image = augment(cut.image)
-    matrix = torch.as_tensor(augment.transform_matrix)
-    linear, step = matrix[:, :2, :2], matrix[:, None, :2, 2]
-    u, _, v = torch.linalg.svd(linear)  # what in it is a turn, gaze turns by
-    gaze = torch.cat(((u @ v @ cut.gaze[:, :2, None])[..., 0], cut.gaze[:, 2:]), -1)
-    return cut._replace(image=image, keypoints=cut.keypoints @ linear.mT + step, gaze=gaze)
+def make_data(own: int, one: int, count: int, pool: Executor) -> Data:
+    """Render `own` images of the new cameras, `one` of the one camera, and `count` of other drivers for each test."""
+    print(f"rendering {own} + {one} images to learn from, {count} for each of {len(TESTS)} tests", flush=True)
+    generator = torch.Generator().manual_seed(100)
+    lenses = [faces.lens(name) for name in faces.LENSES]
+    wide = ct.KannalaBrandt.from_fov(OUTSIDE_FOV, image_size=faces.SIZE).double().requires_grad_(False)
+    kinds: dict[str, tuple[int, list[ct.Camera]]] = {
+        "own": (own, lenses),
+        "one": (one, [faces.teacher()]),
+        "seen": (count, [faces.teacher()]),
+        "mounts": (count, lenses),
+        "shutter": (count, lenses),
+        "lens": (count, [wide]),
+        # behind other lenses a face is not on the image from these mounts
+        "mount": (count, [lens for lens in lenses if lens.fov[0] > 2 * OUTSIDE_MOUNTS[0][0]]),
+    }
+    jobs: list[tuple[str, ct.Camera, cabin.Drivers, int]] = []
+    for kind, (number, cameras) in kinds.items():
+        drivers = cabin.random_drivers(number, generator)
+        for camera, rows in zip(cameras, torch.arange(number).tensor_split(len(cameras)), strict=True):
+            jobs += [(kind, camera, drivers[part], len(jobs) + i) for i, part in enumerate(rows.split(CHUNK))]
+    made: dict[tuple[str, str], list[Samples]] = {}
+    for i, (job, found) in enumerate(zip(jobs, pool.map(see, *zip(*jobs, strict=True)), strict=True)):
+        print(f"{i + 1} of {len(jobs)} parts", end="\r", flush=True)
+        for way, samples in found.items():
+            made.setdefault((job[0], way), []).append(samples)
+    whole = {key: Samples(*(torch.cat(v, 1) for v in zip(*parts, strict=True))) for key, parts in made.items()}
+    learned = {way: samples for (kind, way), samples in whole.items() if kind in ("own", "one")}
+    tests = {way: {kind: whole[kind, way] for kind in TESTS} for way in ("plain", "box")}
+    return Data(learned, tests)
 
 
-def warped(seen: Photographs, index: Tensor, warp: ct.Warp, whole: Tensor) -> Samples:
-    """What becomes of photographs by a warp."""
-    pixels = seen.camera.project(seen.points[index, : len(NAMES)])[0]
-    keypoints = warp.transform_points(pixels)[0].float()
-    gaze = warp.transform_rays(seen.gaze[index][:, None])[:, 0].float()
-    return Samples(warp(seen.image[index]), keypoints, gaze, faces.corner_rays(warp.target), whole.float())
+def see(kind: str, camera: ct.Camera, drivers: cabin.Drivers, seed: int) -> dict[str, Samples]:
+    """Render N drivers and return V crops of each, (V, N, ...), for each way to make crops."""
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)  # RandomAffine takes no generator
+    generator = torch.Generator().manual_seed(seed)
+    if kind in ("one", "seen"):
+        mounts = torch.zeros(len(drivers), 3)
+    else:
+        mounts = faces.mounts(camera, drivers, generator, OUTSIDE_MOUNTS if kind == "mount" else faces.MOUNTS)
+    rates = faces.RATE * (2 * torch.rand(len(drivers), 3, generator=generator) - 1) * (kind == "shutter")
+    seen = faces.photograph(camera, drivers, mounts, rates, OWN_WIDER if kind == "own" else faces.WIDER)
+    seen = seen.rows(seen.whole.nonzero()[:, 0])  # a camera that sees the face from no mount has no image of it
+    if kind in TESTS:
+        return {"plain": stacked([crops.plain_crops(seen)]), "box": stacked([crops.box_crops(seen)])}
+    parts = [seen.rows(rows) for rows in torch.arange(len(seen.image)).split(50)]
+    made = {}
+    for way, augment in ({"own": crops.as_taken} if kind == "own" else crops.AUGMENTATIONS).items():
+        rounds = [[augment(part, generator) for part in parts] for _ in range(VIEWS[way])]
+        made[way] = stacked([Samples(*map(torch.cat, zip(*samples, strict=True))) for samples in rounds])
+    return made
 
 
-AUGMENTATIONS: dict[str, Augment] = {"plain": plain, "affine": by_affine, "camtorch": by_camera, "own": as_taken}
+def stacked(views: list[Samples]) -> Samples:
+    """Join several views of each of N images, (V, N, ...), with images in bytes."""
+    samples = Samples(*map(torch.stack, zip(*views, strict=True)))
+    return samples._replace(image=(255 * samples.image).round().byte())
 
 
 # -- learning
 
 
-class Network(nn.Module):
-    """Samples of faces to keypoints (B, N, 2) and unit gazes (B, 3); perhaps it is told where faces are."""
-
-    def __init__(self, with_rays: bool = False) -> None:
-        super().__init__()
-        layers: list[nn.Module] = []
-        channels = (3, 16, 32, 32, 48, 64, 64)
-        for inputs, outputs, stride in zip(channels, channels[1:], (2, 2, 1, 2, 1, 2), strict=False):
-            layers += [nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.GroupNorm(4, outputs), nn.ReLU()]
-        self.see = nn.Sequential(*layers, nn.Flatten(), nn.Linear(64 * (SIDE // 16) ** 2, 128), nn.ReLU())
-        self.keypoints = nn.Linear(128, 2 * len(NAMES))
-        self.gaze = nn.Sequential(nn.Linear(128 + 12, 64), nn.ReLU(), nn.Linear(64, 3))
-        self.with_rays = with_rays
-
-    def forward(self, samples: Samples) -> tuple[Tensor, Tensor]:
-        """Keypoints and gaze."""
-        seen = self.see((samples.image - 0.5).contiguous(memory_format=torch.channels_last))
-        keypoints = 20 * self.keypoints(seen).unflatten(1, (len(NAMES), 2)) + (SIDE - 1) / 2
-        gaze = self.gaze(torch.cat((seen, samples.rays.flatten(1) * self.with_rays), 1))
-        return keypoints, F.normalize(gaze - gaze.new_tensor([0.0, 0.0, 1.0]), dim=-1)
+def batches(contestant: Contestant, learned: dict[str, Samples], generator: torch.Generator) -> Iterator[Samples]:
+    """Yield batches of the crops that a contestant learns from; if of both kinds, half of each."""
+    sets = []
+    for way, number in (("own", contestant.own), (contestant.augmentation, contestant.one)):
+        if number:
+            sets.append((learned[way], torch.randperm(learned[way].image.shape[1], generator=generator)[:number]))
+    while True:
+        parts = []
+        for samples, rows in sets:
+            drawn = torch.rand(2, BATCH // len(sets), generator=generator)
+            view, row = (drawn * torch.tensor([[len(samples.image)], [len(rows)]])).long()
+            parts.append(Samples(*(values[view, rows[row]] for values in samples)))
+        yield floats(Samples(*map(torch.cat, zip(*parts, strict=True))))
 
 
-def loss_of(found: tuple[Tensor, Tensor], samples: Samples) -> Tensor:
-    """How far off keypoints and gaze are found: a radian costs as much as 40 pixels."""
-    keypoints, gaze = found
-    off = F.smooth_l1_loss(keypoints, samples.keypoints, reduction="none", beta=2.0).sum(-1).mean(-1)
-    off = off + 40 * (gaze - samples.gaze).norm(dim=-1)
-    mean: Tensor = (off * samples.weight).sum() / samples.weight.sum().clamp(min=1)
-    return mean
+def floats(samples: Samples) -> Samples:
+    """Return samples with images in [0, 1]."""
+    return samples._replace(image=samples.image / 255)
 
 
-@torch.no_grad()
-def medians(network: Network, test: Samples) -> tuple[float, float]:
-    """How far keypoints are off, as a part of the distance between the eyes, and gaze, in degrees."""
-    keypoints, gaze = network(test)
-    eyes = (test.keypoints[:, :2].mean(1) - test.keypoints[:, 2:4].mean(1)).norm(dim=-1, keepdim=True)
-    share = (keypoints - test.keypoints).norm(dim=-1) / eyes
-    degrees = torch.rad2deg(2 * torch.asin((gaze - test.gaze).norm(dim=-1).clamp(max=2) / 2))
-    return float(share.median()), float(degrees.median())
-
-
-class Result(NamedTuple):
-    """What a network learned from, and what it then finds."""
-
-    examples: Samples
-    """Two of the images that it learned from."""
-    found: tuple[Tensor, Tensor]
-    """Keypoints and gaze in the last test."""
-    curves: dict[str, list[tuple[int, float, float]]]
-    """By the test: a step, and what `medians` was after it."""
-
-
-def train(
-    name: str, network: Network, seen: list[Photographs], tests: dict[str, Samples], steps: int, seed: int
-) -> Result:
-    """Train a network on batches of 32 photographs, of one camera after the other, and look how it does."""
-    generator = torch.Generator().manual_seed(seed)
-    augment = AUGMENTATIONS[name.removesuffix("_rays")]
-    network.with_rays = name.endswith("_rays")
+def train(contestant: Contestant, data: Data, steps: int, seed: int) -> dict[str, list[float]]:
+    """Train a network and return `medians` by the test."""
+    torch.manual_seed(seed)  # also of RandomAffine
+    network = Network(contestant.rays)
     optimizer = torch.optim.AdamW(network.parameters(), weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 5e-3, total_steps=steps, pct_start=0.2)
-    curves: dict[str, list[tuple[int, float, float]]] = {test: [] for test in tests}
-    for step in range(1, steps + 1):
-        taken = seen[step % len(seen)]
-        samples = augment(taken, torch.randint(len(taken.image), (32,), generator=generator), generator)
+    learned = batches(contestant, data.learned, torch.Generator().manual_seed(seed))
+    for samples, _ in zip(learned, range(steps), strict=False):
         loss = loss_of(network(samples), samples)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         schedule.step()
-        if step % LOOKS == 0 or step == steps:
-            for test, held_out in tests.items():
-                curves[test].append((step, *medians(network, held_out)))
-        if step % (6 * LOOKS) == 0 or step == steps:
-            print(f"{TRAINING_SETS[name]:<26} step {step} of {steps}, loss {loss.item():.2f}", flush=True)
-    examples = augment(seen[0], torch.arange(min(12, len(seen[0].image))), torch.Generator().manual_seed(seed))
-    with torch.no_grad():
-        found = network(tests["shutter"])
-    return Result(Samples(*(values[examples.weight > 0][:2] for values in examples)), found, curves)
+    tests = data.tests["box" if contestant.augmentation == "box" else "plain"]
+    return {name: medians(network, floats(Samples(*(values[0] for values in test)))) for name, test in tests.items()}
 
 
-def run(images: int = 400, count: int = 150, steps: int = 1500, seed: int = 0) -> tuple[dict[str, Result], Samples]:
-    """Render, train and evaluate; `count` other faces are in each test.
+# -- all networks, and the file of their results
 
-    Returns:
-        a result for each of `TRAINING_SETS`, and the last test.
+
+def one_job(file: str, name: str, steps: int, seed: int) -> tuple[str, str, dict[str, list[float]], float]:
+    """Train one network with one thread and return seed, name, medians and seconds."""
+    torch.set_num_threads(1)  # networks side by side keep cores busier than many threads on small images
+    start = time.perf_counter()
+    found = train(CONTESTANTS[name], load(file), steps, seed)
+    return str(seed), name, found, time.perf_counter() - start
+
+
+@functools.cache
+def load(file: str) -> Data:
+    """Read the crops, which processes share."""
+    return Data(*torch.load(file, weights_only=False, mmap=True))
+
+
+def run(
+    numbers: Path,
+    rendered: Path,
+    *,
+    own: int = 10000,
+    one: int = 2000,
+    count: int = 400,
+    steps: int = 1000,
+    seeds: int = 5,
+    workers: int = os.cpu_count() or 1,
+) -> dict[str, Any]:
+    """Train each contestant with each seed, except those whose result `numbers` has.
+
+    Args:
+        numbers: JSON file of settings and results: by the seed, the contestant and the test, `medians`.
+        rendered: file of the crops, which is written if it is missing.
+        own: images of the new cameras, to learn from.
+        one: images of the one camera.
+        count: of other drivers, in each test.
+        steps: of each network.
+        seeds: how many.
+        workers: processes; 0 trains in this one.
     """
-    print(f"rendering twice {images} images to learn from, {count} for each of {len(TESTS)} tests", flush=True)
-    generator = torch.Generator().manual_seed(seed)
-    drivers, others = (cabin.random_drivers(n, generator) for n in (images, count))
-    seen = [faces.photograph(drivers)]
-    mounts, shutter = (faces.by_others(others, generator, rolling=rolling) for rolling in (False, True))
-    tests = {"seen": faces.by_teacher(others), "mounts": mounts, "shutter": shutter}
-    own = [
-        faces.photograph_mounted(drivers[rows], faces.lens(name), generator)
-        for name, rows in zip(faces.LENSES, torch.arange(images).tensor_split(len(faces.LENSES)), strict=True)
-    ]
-    learned = {name: own if name.startswith("own") else seen for name in TRAINING_SETS}
-    torch.manual_seed(seed)
-    first = Network()
-    # A thread for each network keeps cores busier than many threads on one small image
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            jobs = [pool.submit(train, n, copy.deepcopy(first), learned[n], tests, steps, seed) for n in TRAINING_SETS]
-            results = dict(zip(TRAINING_SETS, (job.result() for job in jobs), strict=True))
-    finally:
-        torch.set_num_threads(threads)
-    print(f"\n{'learned from':<26}" + "".join(f"{title:>25}" for title in TESTS.values()))
-    for name, result in results.items():
-        last = [result.curves[test][-1] for test in TESTS]
-        columns = [f"{100 * share:12.1f} %{degrees:7.1f} deg" for _, share, degrees in last]
-        print(f"{TRAINING_SETS[name]:<26}" + "".join(columns))
-    return results, shutter
+    settings = {"own": own, "one": one, "count": count, "steps": steps}
+    kept: dict[str, Any] = {"settings": settings, "results": {}}
+    if numbers.exists():
+        kept = json.loads(numbers.read_text())
+        if kept["settings"] != settings:
+            raise ValueError(f"{numbers} must be of the same settings, {settings}; got {kept['settings']}")
+    jobs = [(seed, name) for seed in range(seeds) for name in CONTESTANTS]
+    jobs = [(seed, name) for seed, name in jobs if name not in kept["results"].get(str(seed), {})]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context) if workers else ThreadPoolExecutor(1) as pool:
+        if jobs and not rendered.exists():
+            torch.save(tuple(make_data(own, one, count, pool)), rendered)
+        done = [pool.submit(one_job, str(rendered), name, steps, seed) for seed, name in jobs]
+        for job in as_completed(done):
+            seed, name, found, seconds = job.result()
+            kept["results"].setdefault(seed, {})[name] = found
+            numbers.write_text(json.dumps(kept) + "\n")
+            print(f"seed {seed}, {name:<18} {found['mounts']}, {seconds:.0f} s", flush=True)
+    return kept
 
 
-def draw(results: dict[str, Result], test: Samples, output: str, count: int = 6) -> None:
-    """One figure: two images that each network learned from, and what it finds in the same test images."""
-    figure, axes = plt.subplots(len(results), 2 + count, figsize=(13, 1.8 * len(results) + 0.5), layout="constrained")
-    figure.suptitle("left: what was learned from; right: other cameras, blue is true and red is found")
-    some = torch.arange(count) * (len(test.image) // count)
-    for row, (name, result) in zip(axes, results.items(), strict=True):
-        row[0].set_title(TRAINING_SETS[name], fontsize="medium", loc="left")
-        for axis, samples, i in zip(row, [result.examples] * 2 + [test] * count, [0, 1, *some.tolist()], strict=True):
-            axis.set_axis_off()
-            if i >= len(samples.image):
-                continue
-            axis.imshow(samples.image[i].permute(1, 2, 0).numpy())
-            looks = [(samples.keypoints[i], samples.gaze[i], "#1e64f0")]
-            if samples is test:
-                looks.append((result.found[0][i], result.found[1][i], "#e21d48"))
-            for keypoints, gaze, colour in looks:
-                start = samples.keypoints[i, :4].mean(0)
-                axis.plot(*keypoints.T.numpy(), ".", color=colour, markersize=4)
-                axis.plot(*torch.stack((start, start + 0.45 * SIDE * gaze[:2])).T.numpy(), color=colour)
-    figure.savefig(output, dpi=100)
+# -- table and figure
+
+
+def values(kept: dict[str, Any], name: str, test: str, which: int) -> list[float]:
+    """Return the medians of each seed, of landmarks in % (0) or of gaze in degrees (1)."""
+    return [seed[name][test][which] * (1 if which else 100) for seed in kept["results"].values() if name in seed]
+
+
+def table(kept: dict[str, Any]) -> str:
+    """Return the table of all contestants, in Markdown: means of the seeds and their standard deviations."""
+    columns = [(0, "mounts", " %"), *((1, test, "°") for test in TESTS)]
+    titles = ["learned from", f"landmarks, {TESTS['mounts']}", *(f"gaze, {title}" for title in TESTS.values())]
+    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
+    for name, contestant in CONTESTANTS.items():
+        cells = [contestant.title]
+        for which, test, unit in columns:
+            seeds = values(kept, name, test, which)
+            cells.append(f"{statistics.mean(seeds):.1f}{unit} ± {statistics.pstdev(seeds):.1f}")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def draw(kept: dict[str, Any], output: str | Path) -> None:
+    """Draw errors over the number of the new cameras' own images: means of the seeds, and bands of all seeds."""
+    curves = {
+        "the new cameras' own": ["own 80", "own 400", "own 2000", "own 10000"],
+        "... and 400 of one camera with camtorch": ["both 80", "both 400", "both 2000"],
+        "400 of one camera with camtorch": ["camtorch"],
+        "2,000 of one camera with camtorch": ["camtorch 2000"],
+        "400 of one camera": ["plain"],
+    }
+    panels = {
+        "gaze, new lenses and mounts, degrees": ("mounts", 1),
+        "gaze, mounts outside, degrees": ("mount", 1),
+        "landmarks, new lenses and mounts, %": ("mounts", 0),
+    }
+    figure, axes = plt.subplots(1, len(panels), figsize=(13, 4.4), layout="constrained")
+    for axis, (title, (test, which)) in zip(axes, panels.items(), strict=True):
+        for colour, (label, names) in zip(COLOURS, curves.items(), strict=False):
+            one = len(names) == 1  # which has none of the new cameras' images: a line across
+            counts = [80, 10000] if one else [CONTESTANTS[name].own for name in names]
+            seeds = [values(kept, name, test, which) for name in (names * 2 if one else names)]
+            axis.plot(counts, [*map(statistics.mean, seeds)], "--" if one else "o-", color=colour, label=label, ms=4)
+            axis.fill_between(counts, [*map(min, seeds)], [*map(max, seeds)], color=colour, alpha=0.15, linewidth=0)
+        axis.set_title(title, fontsize="medium")
+        axis.set_xscale("log")
+        axis.set_xticks([80, 400, 2000, 10000], ["80", "400", "2,000", "10,000"])
+        axis.minorticks_off()
+        axis.set_ylim(0)
+        axis.set_xlabel("the new cameras' own images")
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(output, dpi=90)
     plt.close(figure)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", default="faces.png")
-    draw(*run(), parser.parse_args().output)
+    parser.add_argument("-n", "--numbers", type=Path, default=NUMBERS, help="file of results, read and written")
+    parser.add_argument("-r", "--rendered", type=Path, default="train_faces.pt", help="file of crops, 3 GB")
+    parser.add_argument("-s", "--seeds", type=int, default=5)
+    arguments = parser.parse_args()
+    numbers = run(arguments.numbers, arguments.rendered, seeds=arguments.seeds)
+    print(table(numbers))
+    draw(numbers, arguments.output)

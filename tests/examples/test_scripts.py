@@ -19,9 +19,9 @@ import torch
 import train_faces
 from boards import FOLDER, ov_plane
 from PIL import Image
-from scenes import cabin, driver, faces, walls
+from scenes import cabin, crops, driver, faces, walls
 from scenes.cabin import CLASSES, LANDMARKS, random_drivers, render_classes
-from scenes.faces import NAMES, SIDE, SIZE, Photographs, Samples
+from scenes.faces import NAMES, SIDE, Photographs, Samples
 
 import camtorch as ct
 
@@ -170,7 +170,7 @@ def drivers() -> cabin.Drivers:
 
 @pytest.fixture(scope="module")
 def seen(drivers) -> Photographs:
-    return Photographs(torch.rand(len(drivers), 3, *SIZE), faces.points_of(drivers), drivers.gaze, faces.teacher())
+    return faces.photograph(faces.teacher(), drivers)
 
 
 def looks_true(samples: Samples, drivers: cabin.Drivers) -> None:
@@ -187,35 +187,51 @@ def looks_true(samples: Samples, drivers: cabin.Drivers) -> None:
     assert bool(((samples.keypoints > -1) & (samples.keypoints < SIDE))[whole].all())
 
 
-@pytest.mark.parametrize("name", ["plain", "camtorch", "own"])
-def test_labels_learned_from_are_true(name, seen, drivers):
-    def learned():
-        torch.manual_seed(1)
-        return train_faces.AUGMENTATIONS[name](seen, torch.arange(len(seen.image)), torch.Generator().manual_seed(1))
-
-    samples = learned()
+@pytest.mark.parametrize("crop", [crops.plain, crops.with_camtorch, crops.with_box_crop, crops.as_taken])
+def test_labels_learned_from_are_true(crop, seen, drivers):
+    samples, again = (crop(seen, torch.Generator().manual_seed(1)) for _ in range(2))
     looks_true(samples, drivers)
-    assert all(torch.equal(*pair) for pair in zip(samples, learned(), strict=True))
+    assert all(torch.equal(*pair) for pair in zip(samples, again, strict=True))
 
 
 @pytest.mark.slow
-def test_labels_of_tests_are_true(drivers):
-    drivers = drivers[: len(faces.LENSES)]
-    looks_true(faces.by_teacher(drivers), drivers)
-    still, rolling = (faces.by_others(drivers, torch.Generator().manual_seed(3), rolling=r) for r in (False, True))
+@pytest.mark.parametrize("crop", [crops.plain_crops, crops.box_crops])
+def test_labels_of_tests_are_true(crop, drivers):
+    drivers = drivers[:5]
+    lens, generator = faces.lens("aria"), torch.Generator().manual_seed(3)
+    mounts = faces.mounts(lens, drivers, generator)
+    still, rolling = (crop(faces.photograph(lens, drivers, mounts, r * torch.ones(5, 3))) for r in (0, faces.RATE))
     looks_true(still, drivers)
-    assert bool((still.weight == 1).all())
     assert torch.equal(still.rays, rolling.rays)
     assert 0.5 < (still.keypoints - rolling.keypoints).abs().max() < 10
 
 
 @pytest.mark.slow
-def test_a_small_run_tries_all_networks_in_all_tests(tmp_path):
-    results, test = train_faces.run(images=5, count=5, steps=1, seed=2)
-    assert list(results) == list(train_faces.TRAINING_SETS)
-    assert all(list(result.curves) == list(train_faces.TESTS) for result in results.values())
-    train_faces.draw(results, test, str(tmp_path / "faces.png"))
+def test_a_small_run_goes_on_where_it_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(train_faces, "VIEWS", dict.fromkeys(train_faces.VIEWS, 1))
+    small = {"own": 10, "one": 5, "count": 5, "steps": 1, "workers": 0}
+    files = tmp_path / "faces.json", tmp_path / "faces.pt"
+    first = train_faces.run(*files, **small, seeds=1)
+    assert first == json.loads(files[0].read_text())
+    numbers = first["results"].pop("0")
+    assert list(numbers) == list(train_faces.CONTESTANTS)
+    assert all(list(tests) == list(train_faces.TESTS) for tests in numbers.values())
+    del numbers["plain"]
+    files[0].write_text(json.dumps(first | {"results": {"0": numbers}}))
+    trained = []
+    monkeypatch.setattr(train_faces, "train", lambda *job: trained.append(job) or numbers["camtorch"])
+    kept = train_faces.run(*files, **small, seeds=1)
+    assert [job[0] for job in trained] == [train_faces.CONTESTANTS["plain"]]
+    assert kept["results"]["0"] == numbers | {"plain": numbers["camtorch"]}
+    train_faces.draw(kept, tmp_path / "faces.png")
     assert is_a_figure(tmp_path / "faces.png")
+    with pytest.raises(ValueError, match="must be of the same settings"):
+        train_faces.run(*files, **small | {"steps": 2})
+
+
+def test_the_page_has_the_numbers_of_the_file():
+    page = Path(train_faces.__file__).parents[1] / "docs" / "guides" / "case-study.md"
+    assert train_faces.table(json.loads(train_faces.NUMBERS.read_text())) in page.read_text()
 
 
 @pytest.fixture(scope="module")
