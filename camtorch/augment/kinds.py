@@ -129,9 +129,7 @@ KINDS = {
     "pose": _POSE,
     "rvec": Field(1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector, True),
     "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions, True),
-    "rotation": Field(
-        2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns), True
-    ),
+    "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns)),
 }
 _TURNED = "points", "gaze", "directions", "tvec", "landmarks"
 _MATRICES = "head_pose", "pose", "rotation"
