@@ -3,11 +3,9 @@
 Networks find landmarks in images of rendered drivers' faces, and the direction of gaze. Some learn from images of one
 camera, some from 80 to 10,000 images of the cameras of the tests, some from both. They start from the same weights for
 a seed, and take the same number of steps. The script writes the result of each network into a file, reads those that
-the file has, and trains the others; `examples/train_faces.json` has all, so that this only draws them:
+the file has, and trains the others. All take two hours on two cores; `--numbers FILE` begins a new file.
 
     python examples/train_faces.py -o faces.png
-
-`--numbers FILE` measures anew (an hour and a half on two cores).
 """
 
 import argparse
@@ -46,6 +44,8 @@ class Contestant(NamedTuple):
     """How many images of the cameras of the tests."""
     rays: bool = True
     """Whether the network receives the rays of the corners of each crop."""
+    longer: int = 1
+    """How many times as many steps the network learns."""
 
 
 CONTESTANTS = {
@@ -63,6 +63,8 @@ CONTESTANTS = {
     "camtorch, no rays": Contestant("400 of one camera with camtorch, no rays", 400, rays=False),
     "box, no rays": Contestant("400 of one camera with camtorch and BoxCrop, no rays", 400, "box", rays=False),
 }
+LONGER = "own 80", "own 400", "own 2000", "own 10000", "camtorch", "camtorch 2000", "both 2000", "box, no rays"
+CONTESTANTS |= {f"{name}, longer": CONTESTANTS[name]._replace(longer=4) for name in LONGER}
 TESTS = {
     "seen": "the same camera",
     "mounts": "new lenses and mounts",
@@ -196,7 +198,7 @@ def one_job(file: str, name: str, steps: int, seed: int) -> tuple[str, str, dict
     """Train one network with one thread and return seed, name, medians and seconds."""
     torch.set_num_threads(1)  # networks side by side keep cores busier than many threads on small images
     start = time.perf_counter()
-    found = train(CONTESTANTS[name], load(file), steps, seed)
+    found = train(CONTESTANTS[name], load(file), steps * CONTESTANTS[name].longer, seed)
     return str(seed), name, found, time.perf_counter() - start
 
 
@@ -254,7 +256,7 @@ def run(
 
 
 def values(kept: dict[str, Any], name: str, test: str, which: int) -> list[float]:
-    """Return the medians of each seed, of landmarks in % (0) or of gaze in degrees (1)."""
+    """Return the medians of the seeds that are done, of landmarks in % (0) or of gaze in degrees (1)."""
     return [seed[name][test][which] * (1 if which else 100) for seed in kept["results"].values() if name in seed]
 
 
@@ -264,11 +266,15 @@ def table(kept: dict[str, Any]) -> str:
     titles = ["learned from", f"landmarks, {TESTS['mounts']}", *(f"gaze, {title}" for title in TESTS.values())]
     lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     for name, contestant in CONTESTANTS.items():
-        cells = [contestant.title]
-        for which, test, unit in columns:
+        done = len(values(kept, name, "mounts", 0))
+        longer = f"; {contestant.longer} times the steps, seeds: {done}" if contestant.longer > 1 else ""
+        cells = [contestant.title + longer]
+        for which, test, unit in columns if done else []:
             seeds = values(kept, name, test, which)
-            cells.append(f"{statistics.mean(seeds):.1f}{unit} ± {statistics.pstdev(seeds):.1f}")
-        lines.append(f"| {' | '.join(cells)} |")
+            spread = f" ± {statistics.pstdev(seeds):.1f}" if done > 1 else ""
+            cells.append(f"{statistics.mean(seeds):.1f}{unit}{spread}")
+        if done:
+            lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -282,23 +288,27 @@ def draw(kept: dict[str, Any], output: str | Path) -> None:
         "400 of one camera": ["plain"],
     }
     panels = {
-        "gaze, new lenses and mounts, degrees": ("mounts", 1),
-        "gaze, mounts outside, degrees": ("mount", 1),
-        "landmarks, new lenses and mounts, %": ("mounts", 0),
+        "gaze, degrees": (1, ""),
+        "gaze, degrees; four times the steps": (1, ", longer"),
+        "landmarks, %": (0, ""),
+        "landmarks, %; four times the steps": (0, ", longer"),
     }
-    figure, axes = plt.subplots(1, len(panels), figsize=(13, 4.4), layout="constrained")
-    for axis, (title, (test, which)) in zip(axes, panels.items(), strict=True):
+    figure, axes = plt.subplots(1, len(panels), figsize=(14, 4.2), layout="constrained")
+    for axis, (title, (which, suffix)) in zip(axes, panels.items(), strict=True):
         for colour, (label, names) in zip(COLOURS, curves.items(), strict=False):
-            one = len(names) == 1  # which has none of the new cameras' images: a line across
-            counts = [80, 10000] if one else [CONTESTANTS[name].own for name in names]
-            seeds = [values(kept, name, test, which) for name in (names * 2 if one else names)]
-            axis.plot(counts, [*map(statistics.mean, seeds)], "--" if one else "o-", color=colour, label=label, ms=4)
-            axis.fill_between(counts, [*map(min, seeds)], [*map(max, seeds)], color=colour, alpha=0.15, linewidth=0)
+            seeds = {name: values(kept, name + suffix, "mounts", which) for name in names}
+            errors = [error for error in seeds.values() if error]
+            counts = [CONTESTANTS[name].own for name, error in seeds.items() if error]
+            if counts == [0]:  # none of the new cameras' images: a line across
+                counts, errors = [80, 10000], errors * 2
+            style = "--" if len(names) == 1 else "o-"
+            axis.plot(counts, [*map(statistics.mean, errors)], style, color=colour, label=label, markersize=4)
+            axis.fill_between(counts, [*map(min, errors)], [*map(max, errors)], color=colour, alpha=0.15, linewidth=0)
         axis.set_title(title, fontsize="medium")
         axis.set_xscale("log")
         axis.set_xticks([80, 400, 2000, 10000], ["80", "400", "2,000", "10,000"])
         axis.minorticks_off()
-        axis.set_ylim(0)
+        axis.set_ylim(0, 17 if which == 0 else 13)
         axis.set_xlabel("the new cameras' own images")
         axis.spines[["top", "right"]].set_visible(False)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
