@@ -9,19 +9,15 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
-from camtorch.values.arguments import Numbers, _as_plain, as_values
+from camtorch.values.arguments import Numbers, as_values
 from camtorch.values.module import BatchedModule, remade
 
 
 def as_tensor(values: Numbers, name: str, owner: str, device: torch.device) -> Tensor:
     """Return a tensor of numbers, which may be NaN, from a tensor, an array, or lists, also of tensors of one shape."""
     if isinstance(values, (list, tuple)) and values and all(getattr(v, "ndim", 0) for v in values):
-        parts = [as_tensor(v, f"{name}[{i}]", owner, device) for i, v in enumerate(values)]
-        if len({part.shape for part in parts}) > 1:
-            shapes = ", ".join(str(tuple(part.shape)) for part in parts[:8])
-            raise ValueError(f"{owner}: the parts of {name} must have one shape; got {shapes}. Pad pixels with NaN")
-        return torch.stack(parts)
-    return as_values(_as_plain(values), name, owner, device)
+        return torch.stack([as_values(v, f"{name}[{i}]", owner, device) for i, v in enumerate(values)])
+    return as_values(values, name, owner, device)
 
 
 def as_vectors(values: Numbers, name: str, size: int, owner: str, device: torch.device) -> Tensor:

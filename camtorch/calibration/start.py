@@ -70,10 +70,9 @@ def start_from_nothing(
 ) -> State:
     """Return a camera of the model, B = 1, and the poses of all views, from which an adjustment reaches the optimum.
 
-    Unified cameras of many widths are tried, with the axis in the middle of the image: the pixels' rays give poses in
-    closed form, whose errors rank the cameras. The best few are refined with a Cauchy loss, and the model is fitted to
-    the best one from several starts. Parameters in `fixed` are held: coefficients as in `Camera.ideal`, the principal
-    point in the middle. `loss`, with its scale in px, decides between fits that are nearly as good.
+    Unified cameras of many widths are ranked by the errors of the poses that their rays give in closed form. The best
+    few are refined with a Cauchy loss, and the model is fitted to the best one from several starts. Parameters in
+    `fixed` are held: coefficients as in `Camera.ideal`, the principal point in the middle of the image.
     """
     few, free = _subsample(observations, image_size), _free_parameters(model, count, fixed)
     lens = first = _find_unified(few, image_size, fixed)
@@ -86,13 +85,11 @@ def start_from_nothing(
     if few is not observations or len(lens.parameters) > 1 or bool(lens.lost(few).any()):
         lens = _refine(lens, few, free, (loss, loss_scale))
         one = lens.of(slice(1))
-        lost = int(one.lost(few).sum())
-        if lost > (_LOST * int(few.seen.sum()) if one.scale <= _ERRS * first.scale else 0):
-            inliers = few.seen & (first.errors(few)[0] < _OUTLIER * first.scale)
-            furthest = math.degrees(float(angles_from_axis(first.boards.moved(few.points))[0][inliers].amax()))
+        lost, seen = int(one.lost(few).sum()), int(few.seen.sum())
+        if lost > (_LOST * seen if one.scale <= _ERRS * first.scale else 0):
             raise ValueError(
-                f"calibrate: model must have pixels for corners up to about {furthest:.0f} degrees from the axis; got "
-                f"{one.model.__name__}, without {lost} of {int(few.seen.sum())}. Use a fisheye, such as kannala_brandt"
+                f"calibrate: model must have pixels for all corners; got {one.model.__name__}, without {lost} of {seen}"
+                ". Use a fisheye, such as kannala_brandt"
             )
     state = lens.of(slice(1)).state
     if few is not observations:

@@ -62,7 +62,7 @@ def test_a_model_that_errs_and_loses_a_few_corners_says_so():
     too_many = is_far & (is_far.flatten().cumsum(0).view(is_far.shape) > 4)
     pixels = seen.image_points.masked_fill(too_many[..., None], torch.nan)
     pixels = pixels[(~pixels.isnan().any(-1)).sum(-1) >= 20]
-    with pytest.raises(ValueError, match=r"degrees from the axis; got Pinhole, without \d+ of \d+\. Use"):
+    with pytest.raises(ValueError, match=r"for all corners; got Pinhole, without \d+ of \d+\. Use"):
         ct.calibrate("pinhole", seen.object_points, pixels, image_size=SIZE)
 
 
