@@ -1,3 +1,4 @@
+import gc
 import sys
 import warnings
 
@@ -16,6 +17,16 @@ torch.set_num_threads(1)
 # the same examples on every machine and in every run; speed is not what these tests are about
 settings.register_profile("camtorch", derandomize=True, deadline=None, max_examples=5, database=None)
 settings.load_profile("camtorch")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Imported modules and tests stay: the garbage collector need not look at them, again and again."""
+    gc.disable()
+    collected = yield
+    gc.freeze()
+    gc.enable()
+    return collected
 
 
 def pytest_collection_modifyitems(items):
