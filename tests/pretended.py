@@ -64,10 +64,17 @@ class Pretended(torch.Tensor):
         return self.cpu().numpy(force=True)
 
 
+@functools.cache
+def known(operator):
+    """An operator's name, and whether it only looks: its results are views."""
+    schema = operator._schema
+    views = any(value.alias_info and not value.alias_info.is_write for value in schema.returns)
+    return schema.name.partition("::")[2], views
+
+
 def run(operator, arguments, options):
     """Run an operator on the CPU, count it, and wrap its results."""
-    name = operator._schema.name.partition("::")[2]
-    mine, others = {}, []
+    (name, views), mine, others = known(operator), {}, []
 
     def on_host(value):
         if isinstance(value, Pretended):
@@ -98,7 +105,6 @@ def run(operator, arguments, options):
             COUNTS["copies"] += 1  # of an index
         if name in INDEXING and not (len(arguments) > 2 and arguments[2].numel() == 1):  # which CUDA fills at once
             COUNTS["syncs"] += any(i is not None and i.dtype == torch.bool for i in arguments[1])
-    views = any(value.alias_info and not value.alias_info.is_write for value in operator._schema.returns)
     COUNTS["syncs"] += name in SYNCS
     COUNTS["launches"] += not views and name not in FREE
     return wrapped(operator(*plain, **named))
