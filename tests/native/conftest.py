@@ -13,13 +13,6 @@ HERE = Path(__file__).parent
 SANITIZERS = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
 
 
-@pytest.fixture(params=["baseline", "best"])
-def variant(request):
-    """The options for one kind of CPU, by the name that drivers of a single variant give it."""
-    name = request.param if request.param in building.VARIANTS else library().camtorch_variant().decode()
-    return {"fuzzed": building.VARIANTS[name]}
-
-
 FASTER = [name for name in building.VARIANTS if name != "baseline"]
 
 
