@@ -14,7 +14,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.calibration.bundle import LOSSES, Adjusted, CameraObservations, Free, Poses, Prior, State, adjust
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
-from camtorch.calibration.start import other_cameras, other_poses, poses_for, start_from_nothing
+from camtorch.calibration.start import as_seen, other_cameras, other_poses, poses_for, start_from_nothing
 from camtorch.calibration.uncertainty import noise_under, shared_factor, spread
 from camtorch.calibration.verdict import Calibration, check_determined
 from camtorch.cameras.camera import Camera
@@ -208,9 +208,7 @@ class Search:
 
     @property
     def observed(self) -> CameraObservations:
-        seen = self.seen
-        weights = seen.seen[None].to(seen.pixels)
-        return CameraObservations(self.asked.kind, seen.points[None], seen.pixels[None], weights, prior=self.prior)
+        return as_seen(self.asked.kind, self.seen, self.prior)
 
     def free(self, bend: bool = False) -> Free:
         """Return the unknowns of a search for this camera alone; `bend` adds the board's shape."""

@@ -95,12 +95,12 @@ def fit(
         except RuntimeError:
             wanted = f"weights must broadcast against the rays {tuple(shape)}"
             raise ValueError(f"{owner}: {wanted}; got {tuple(given.shape)}") from None
-        if bool((given < 0).any()) or not bool(torch.isfinite(given).all()):
+        if not bool(((given >= 0) & (given < math.inf)).all()):
             raise ValueError(f"{owner}: weights must be finite, and not negative; got down to {float(given.min()):.4g}")
         flat_weights = flat_weights * given.sqrt()  # of squares: the fit weighs errors
-    axis = flat_rays.new_tensor([0.0, 0.0, 1.0])
-    unit = torch.where(good[..., None], flat_rays / torch.where(good[..., None], lengths, 1.0), axis)
-    seen = fitting.Observations(unit, torch.where(good[..., None], flat_pixels, 0.0), flat_weights)
+    axis, good = flat_rays.new_tensor([0.0, 0.0, 1.0]), good[..., None]
+    unit = torch.where(good, flat_rays / torch.where(good, lengths, 1.0), axis)
+    seen = fitting.Observations(unit, torch.where(good, flat_pixels, 0.0), flat_weights)
     counts = seen.weights > 0
     if not counts.numel() or not bool((counts.sum(-1) >= _LEAST).all()):
         raise ValueError(

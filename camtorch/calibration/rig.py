@@ -68,13 +68,12 @@ class RigCalibration:
         lines = [f"RigCalibration({head})"]
         first = next(iter(self.cameras))
         for name, camera in self.cameras.items():
-            pose = self.rig.extrinsics[name]
-            turn, shift = pose.rotation.detach(), pose.translation.detach()
             if name != first:
-                angle = math.degrees(float(torch.linalg.vector_norm(turn)))
-                distance = float(torch.linalg.vector_norm(shift))
-                spread = float(torch.linalg.vector_norm(self.mount_std[name][3:]))
-                lines.append(f"{name}: {distance:.6g} +- {spread:.2g} from {first}, turned by {angle:.4g} degrees")
+                pose = self.rig.extrinsics[name]
+                vectors = pose.rotation.detach(), pose.translation.detach(), self.mount_std[name][3:]
+                angle, distance, std = (float(torch.linalg.vector_norm(vector)) for vector in vectors)
+                turned = f"turned by {math.degrees(angle):.4g} degrees"
+                lines.append(f"{name}: {distance:.6g} +- {std:.2g} from {first}, {turned}")
             lines.append(f"{name}: {camera!r}")
         return "\n".join(lines)
 

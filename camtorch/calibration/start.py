@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.calibration.bundle import SETTLED, Adjusted, CameraObservations, Free, Poses, State, adjust, minima
+from camtorch.calibration.bundle import SETTLED, Adjusted, CameraObservations, Free, Poses, Prior, State, adjust, minima
 from camtorch.calibration.observations import Observations
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.cameras.camera import Camera
@@ -97,7 +97,7 @@ def start_from_nothing(
     if len(lens.parameters) == 1:
         return state
     lens = lens._replace(boards=state.boards.expand(len(lens.parameters)))
-    observed = [_as_seen(model, observations)]
+    observed = [as_seen(model, observations)]
     found = adjust(observed, lens.state, free, loss=loss, loss_scale=loss_scale, steps=_MANY_STEPS)
     return found.state.of(found.cost.argmin()[None])
 
@@ -189,7 +189,7 @@ class _Lens(NamedTuple):
         """Return adjusted cameras, the best first, without doubles and costs above `worst` times the least."""
         name, scale = loss or ("cauchy", self.scale)
         settled = _NEARLY if loss is None else SETTLED
-        observed = _as_seen(self.model, few)
+        observed = as_seen(self.model, few)
         found = adjust([observed], self.state, free, loss=name, loss_scale=scale, steps=steps, settled=settled)
         cost, rows = found.cost.sort()
         near = cost <= worst * cost[0]
@@ -201,9 +201,10 @@ class _Lens(NamedTuple):
         return self._replace(parameters=found.state.parameters[0], boards=found.state.boards, scale=scale).of(rows)
 
 
-def _as_seen(model: type[Camera], observations: Observations) -> CameraObservations:
+def as_seen(model: type[Camera], observations: Observations, prior: Prior | None = None) -> CameraObservations:
+    """Return the observations of one camera, for one problem."""
     points, pixels, seen = observations
-    return CameraObservations(model, points[None], pixels[None], seen[None].to(pixels.dtype))
+    return CameraObservations(model, points[None], pixels[None], seen[None].to(pixels.dtype), prior)
 
 
 def _free_parameters(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
