@@ -1,4 +1,4 @@
-"""Rows of arrays, moved one by one, as called by Ray Data's `map_batches`."""
+"""Rows and samples of arrays, moved one by one, as called by Ray Data's `map_batches` and WebDataset's `map`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Part
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.kinds import KINDS, kind_of
+from camtorch.augment.kinds import IMAGES, KEEP, KINDS, kind_of
 from camtorch.augment.numpy import Transform
 from camtorch.augment.sample import Sample
 from camtorch.cameras.camera import Camera
@@ -25,6 +25,7 @@ from camtorch.warp.warp import Warp
 Array: TypeAlias = "np.ndarray[Any, Any]"
 Batch = dict[str, Any]  # column -> an array or a list, all with as many rows
 Moves = Augmentation | FaceNormalizer | Warp  # transforms of samples
+_ENDINGS = ("jpg", "jpeg", "png", "webp", "ppm", "pgm", "tif", "tiff", "bmp", "npy")
 
 
 class Always(Augmentation):
@@ -45,7 +46,81 @@ class Always(Augmentation):
         return Part(rows, self.warp, self.warp.source)
 
 
-class MapBatches:
+class Mover:
+    """Common part of `MapBatches` and `MapSamples`: moves single samples of arrays by their keys."""
+
+    def __init__(self, transform: Moves, seed: int, epoch: int, fields: Mapping[str, str] | None):
+        self._owner = owner = type(self).__name__
+        self._fields = dict(as_mapping(fields, "fields", owner, "{'lidar': 'points'}"))
+        self._seeded: Seeded | None = None
+        self._fixed: Transform
+        if isinstance(transform, (Augmentation, FaceNormalizer)):
+            transform = copy.copy(transform)
+            transform.fields = self._fields = {**transform.fields, **self._fields}
+            if isinstance(transform, FaceNormalizer):
+                self._fixed = Transform(transform)
+            else:
+                self._seeded = Seeded(Transform(transform), seed=seed, epoch=epoch)
+        elif isinstance(transform, Warp):
+            self._fixed = Transform(Always(transform, owner, self._fields))
+        else:
+            raise TypeError(f"{owner}: transform must be an augmentation or a Warp; got {type(transform).__name__}")
+
+    def set_epoch(self, epoch: int) -> None:
+        """Set the epoch of the draws; copies that workers and engines already have are not changed."""
+        if self._seeded is not None:
+            self._seeded.set_epoch(epoch)
+
+    def _moved(self, key: Key | None, row: Mapping[str, Any]) -> Sample:
+        """Return the changed fields of a row of arrays or lists: moved fields, their validity, `rotation`, `camera`."""
+        try:
+            moving = {name: value for name, value in row.items() if self._moves(name, value)}
+            kinds = {name: kind_of(name, value, self._fields, self._owner) or "" for name, value in moving.items()}
+            fields = {name: _dense(name, value, kinds[name]) for name, value in moving.items()}
+            if (camera := row.get("camera")) is not None:
+                fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)
+            if self._seeded is None:
+                return self._fixed(fields)
+            return self._seeded(fields, key=key)  # type: ignore[arg-type]
+        except (ValueError, TypeError) as error:
+            which = "" if key is None else f"sample {key!r:.200}: "
+            kind = TypeError if isinstance(error, TypeError) else ValueError
+            raise kind(f"{self._owner}: {which}{str(error).removeprefix(f'{self._owner}: ')}") from error
+
+    def _moves(self, name: str, value: object) -> bool:
+        """Whether a value is a field that moves, or the validity of one."""
+        if name == "camera" or value is None:
+            return False
+        return name.endswith("_valid") or kind_of(name, value, self._fields, self._owner) is not None
+
+    def _camera(self, parts: Mapping[str, Any], fields: Sample) -> Camera:
+        """Return the camera of its numbers, with the size of an image if it has none."""
+        if parts.get("image_size") is None:
+            images = (v for n, v in fields.items() if kind_of(n, v, self._fields, self._owner) in IMAGES)
+            parts = {**parts, "image_size": next((v.shape[:2] for v in images if np.ndim(v) in (2, 3)), None)}
+        if missing := [part for part in ("model", "intrinsics", "image_size") if parts.get(part) is None]:
+            raise ValueError(f"the camera must have {', '.join(missing)}; got none. ct.data.to_columns makes all")
+        return camera_of({part: _dense(part, value) for part, value in parts.items()}, self._owner)
+
+
+def _dense(name: str, value: Any, kind: str = "") -> Any:
+    """Return lists, or arrays in an array of objects, as an array of numbers, or of bool for validity."""
+    if isinstance(value, list):
+        try:
+            array = np.asarray(value, bool if name.endswith("_valid") else np.float64)
+        except (ValueError, TypeError, OverflowError):
+            raise ValueError(f"{name} must be numbers in lists of one length; got {value!r:.80}") from None
+        if array.size or kind not in KINDS:
+            return array
+        return array.reshape(*[0] * (KINDS[kind].dims - 1), *KINDS[kind].last)
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        parts = [_dense(name, part) for part in value]
+        if parts and all(isinstance(part, np.ndarray) and part.shape == parts[0].shape for part in parts):
+            return np.stack(parts)
+    return value
+
+
+class MapBatches(Mover):
     """Augmentation or warp of batches of rows: a function for Ray Data's `map_batches` and similar callers.
 
         rows = ray.data.read_images("images/", include_paths=True)
@@ -68,8 +143,8 @@ class MapBatches:
 
     Args:
         transform: an augmentation, or a `Warp` or `Dewarp`.
-        key: the column that identifies a row in every run, of whole numbers or strings such as paths relative to the
-            data set's folder, or a list of such columns, for transforms that draw.
+        key: the column that identifies a row in every run, of whole numbers or strings, or a list of such columns, for
+            transforms that draw. Paths should be relative to the data set's folder, which may differ between machines.
         seed, epoch: seed and epoch of the draws.
         fields: column -> kind, for columns of other names; "keep" passes one on unchanged. See `Augmentation`.
 
@@ -86,32 +161,16 @@ class MapBatches:
         epoch: int = 0,
         fields: Mapping[str, str] | None = None,
     ):
-        self._owner = owner = type(self).__name__
-        self._fields = dict(as_mapping(fields, "fields", owner, "{'lidar': 'points'}"))
-        self._seeded: Seeded | None = None
-        self._fixed: Transform
-        if isinstance(transform, (Augmentation, FaceNormalizer)):
-            transform = copy.copy(transform)
-            transform.fields = self._fields = {**transform.fields, **self._fields}
-            if isinstance(transform, FaceNormalizer):
-                self._fixed = Transform(transform)
-            else:
-                self._seeded = Seeded(Transform(transform), seed=seed, epoch=epoch)
-        elif isinstance(transform, Warp):
-            self._fixed = Transform(Always(transform, owner, self._fields))
-        else:
-            raise TypeError(f"{owner}: transform must be an augmentation or a Warp; got {type(transform).__name__}")
+        super().__init__(transform, seed, epoch, fields)
         self._keys = [key] if isinstance(key, str) else list(key) if is_list(key) else []
         if not (key is None or isinstance(key, str) or is_list(key)) or not all(isinstance(k, str) for k in self._keys):
             raise TypeError(f"{self._owner}: key must be the name of a column, or several in a list; got {shown(key)}")
         if self._seeded is not None and not self._keys:
-            way = 'as in key="path" after read_images(..., include_paths=True)'
-            raise ValueError(f"{self._owner}: key must name the column that identifies a row, {way}; got key={key!r}")
-
-    def set_epoch(self, epoch: int) -> None:
-        """Set the epoch of the draws; copies that engines already have are not changed."""
-        if self._seeded is not None:
-            self._seeded.set_epoch(epoch)
+            raise ValueError(
+                f'{self._owner}: key must name the column that identifies a row, as in key="path" after '
+                "read_images(..., include_paths=True), since the draw of a row depends on its key alone; "
+                f"got key={key!r}"
+            )
 
     def __call__(self, batch: Mapping[str, Any]) -> Batch:
         """Return a batch, moved row by row.
@@ -135,7 +194,7 @@ class MapBatches:
         names = list(dict.fromkeys(name for row in rows for name in row))
         result = {**batch, **{name: _column([row.get(name) for row in rows]) for name in names}}
         for name, column in batch.items():  # columns have one type in all blocks
-            if name in names and getattr(column, "dtype", "") == np.dtype(object):
+            if name in names and _is_objects(column) and not _is_objects(result[name]):
                 result[name] = np.fromiter(result[name], object)
         return result
 
@@ -148,48 +207,9 @@ class MapBatches:
         camera = moved.pop("camera", None)
         return moved if camera is None else {**moved, **to_columns(camera)}
 
-    def _moved(self, key: Key | None, row: Mapping[str, Any]) -> Sample:
-        """Return the changed fields of a row of arrays or lists: moved fields, their validity, `rotation`, `camera`."""
-        try:
-            moving = {name: value for name, value in row.items() if self._moves(name, value)}
-            kinds = {name: kind_of(name, value, self._fields, self._owner) or "" for name, value in moving.items()}
-            fields = {name: _dense(name, value, kinds[name]) for name, value in moving.items()}
-            if (camera := row.get("camera")) is not None:
-                if missing := [part for part in ("model", "intrinsics", "image_size") if camera.get(part) is None]:
-                    raise ValueError(
-                        f"the camera must have {', '.join(missing)}; got none. ct.data.to_columns makes all"
-                    )
-                fields["camera"] = camera_of({part: _dense(part, v) for part, v in camera.items()}, self._owner)
-            if self._seeded is None:
-                return self._fixed(fields)
-            return self._seeded(fields, key=key)  # type: ignore[arg-type]
-        except (ValueError, TypeError) as error:
-            which = "" if key is None else f"sample {key!r:.200}: "
-            kind = TypeError if isinstance(error, TypeError) else ValueError
-            raise kind(f"{self._owner}: {which}{str(error).removeprefix(f'{self._owner}: ')}") from error
 
-    def _moves(self, name: str, value: object) -> bool:
-        """Whether a value is a field that moves, or the validity of one."""
-        if name == "camera" or value is None:
-            return False
-        return name.endswith("_valid") or kind_of(name, value, self._fields, self._owner) is not None
-
-
-def _dense(name: str, value: Any, kind: str = "") -> Any:
-    """Return lists, or arrays in an array of objects, as an array of numbers, or of bool for validity."""
-    if isinstance(value, list):
-        try:
-            array = np.asarray(value, bool if name.endswith("_valid") else np.float64)
-        except (ValueError, TypeError, OverflowError):
-            raise ValueError(f"{name} must be numbers in lists of one length; got {value!r:.80}") from None
-        if array.size or kind not in KINDS:
-            return array
-        return array.reshape(*[0] * (KINDS[kind].dims - 1), *KINDS[kind].last)
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        parts = [_dense(name, part) for part in value]
-        if parts and all(isinstance(part, np.ndarray) and part.shape == parts[0].shape for part in parts):
-            return np.stack(parts)
-    return value
+def _is_objects(column: Any) -> bool:
+    return isinstance(column, np.ndarray) and column.dtype == object
 
 
 def _column(values: list[Any]) -> Array:
@@ -197,3 +217,112 @@ def _column(values: list[Any]) -> Array:
     if len({(getattr(v, "shape", None), getattr(v, "dtype", type(v))) for v in values}) == 1 and values[0] is not None:
         return np.stack(values) if isinstance(values[0], np.ndarray) else np.asarray(values)
     return np.fromiter(values, object)
+
+
+class MapSamples(Mover):
+    """Augmentation or warp of single samples of a WebDataset pipeline: a function for its `.map`.
+
+        samples = wds.WebDataset("train-{00..15}.tar").decode("rgb8")
+        samples = samples.map(ct.data.MapSamples(augment, seed=0))
+
+    A sample is a dict of decoded entries:
+
+    * `jpg`, `png`, `webp` and so on: the image, a uint8 array (H, W, C) or (H, W). `mask.png`, `depth.npy` move by
+      their names.
+    * `json`: an object of labels, named as the fields of an `Augmentation`, of numbers in lists or arrays:
+      `keypoints` [[x, y], ...], `boxes` [[x1, y1, x2, y2], ...], `gaze` [x, y, z], `head_pose` and so on; and `camera`,
+      an object of `model`, `intrinsics`, `distortion` and `image_size`, if the transform has none.
+
+    Lists stay lists, arrays stay arrays, in the same places. `keypoints_valid` and so on, `rotation` and the new
+    `camera` join the labels, so that a `ShardWriter` can write the result. Other entries are passed on. A sample is
+    drawn by its key: its result is the same to the bit from any shard, node or worker.
+
+    Args:
+        transform: an augmentation, or a `Warp` or `Dewarp`.
+        key: the entry that identifies a sample in every run. If several shards hold the same keys, make them different.
+        labels: the entry of labels.
+        seed, epoch: seed and epoch of the draws.
+        fields: name -> kind, for entries and labels of other names; "keep" passes one on unchanged.
+
+    Raises:
+        TypeError: If `transform` moves no samples.
+    """
+
+    def __init__(
+        self,
+        transform: Moves,
+        *,
+        key: str = "__key__",
+        labels: str = "json",
+        seed: int = 0,
+        epoch: int = 0,
+        fields: Mapping[str, str] | None = None,
+    ):
+        super().__init__(transform, seed, epoch, fields)
+        for name, value in (("key", key), ("labels", labels)):
+            if not isinstance(value, str):
+                raise TypeError(f"{self._owner}: {name} must name an entry of a sample; got {shown(value)}")
+        self._key, self._labels = key, labels
+
+    def __call__(self, sample: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a sample, moved.
+
+        Raises:
+            ValueError: If key or decoding is missing, or the augmentation raises one. TypeError: If it is no dict.
+        """
+        owner = self._owner
+        if not isinstance(sample, Mapping):
+            kind = type(sample).__name__
+            raise TypeError(f"{owner}: a sample must be a dict of entries, before .to_tuple; got {kind}")
+        if self._seeded is not None and self._key not in sample:
+            raise ValueError(f"{owner}: a sample must have {self._key!r}; got {', '.join(map(str, sample))}")
+        if not isinstance(labels := sample.get(self._labels, {}), Mapping):
+            raise TypeError(
+                f"{owner}: {self._labels} must be an object of labels; got {type(labels).__name__}"
+                + (". Add .decode() before .map" if isinstance(labels, bytes) else "")
+            )
+        entry_of: dict[str, str] = {}
+        for entry, value in sample.items():
+            if (field := self._field(entry, value)) is not None:
+                if field in entry_of or field in labels:
+                    raise ValueError(f"{owner}: {entry} and {entry_of.get(field, self._labels)} both hold {field}")
+                entry_of[field] = entry
+        moved = self._moved(sample.get(self._key), {**labels, **{f: sample[entry] for f, entry in entry_of.items()}})
+        result, told = dict(sample), dict(labels)
+        for name, value in moved.items():
+            if name in entry_of:
+                result[entry_of[name]] = value
+            elif name == "image_valid":
+                result[f"{name}.npy"] = value
+            elif isinstance(value, Camera):
+                told[name] = dict(zip(PARTS, map(_plain, to_columns(value).values()), strict=True))
+            else:
+                told[name] = value if isinstance(labels.get(name), np.ndarray) else _plain(value)
+        result[self._labels] = told
+        return result
+
+    def _field(self, entry: str, value: Any) -> str | None:
+        """Return the field that an entry holds, or None if it is passed on."""
+        owner, (stem, _, ending) = self._owner, entry.rpartition(".")
+        if entry in self._fields or entry.startswith("__") or entry in (self._key, self._labels):
+            return entry if entry in self._fields else None
+        name = stem if ending in _ENDINGS else entry
+        if not stem and ending in _ENDINGS and ending != "npy":
+            name = "image"
+        if ending in _ENDINGS and isinstance(value, (bytes, bytearray)):
+            raise ValueError(f'{owner}: {entry} must be decoded; got bytes. Add .decode("rgb8") before .map')
+        if self._moves(name or entry, value):
+            if not isinstance(value, np.ndarray):
+                raise TypeError(f"{owner}: {entry} must be a numpy array; got {type(value).__name__}")
+            return name
+        if ending in _ENDINGS and np.ndim(value) >= 2 and name not in self._fields:
+            raise ValueError(
+                f"{owner}: {entry} must have a kind; got none. Pass fields={{{entry!r}: KIND}}, with KIND one of "
+                f"{', '.join(IMAGES)} or {KEEP}, among others"
+            )
+        return None
+
+
+def _plain(value: Any) -> Any:
+    """Return a value in Python's own types, as JSON needs them."""
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

@@ -1,10 +1,12 @@
 """Samples by their keys: draws, batches of arrays and WebDataset's samples are the same however they are divided."""
 
+import json
 import pickle
 
 import numpy as np
 import pytest
 import torch
+import webdataset as wds
 from torch.utils.data import DataLoader, Dataset
 
 import camtorch as ct
@@ -235,13 +237,13 @@ def test_columns_as_engines_hand_them_over():
 
 def test_wrong_batches_are_told():
     function = ct.data.MapBatches(augmentation(), key="path")
-    some, two = batch(rows(2)), ct.augment.collate([camera(), camera()])
+    some = batch(rows(2))
     for change, message in (
         ({"label": [1]}, "all columns must have as many rows"),
         ({"image": some["image"][:, :12]}, r"sample 'day/0.jpg': RandomCamera: image must be of .* got \(12, 32\)"),
         ({"score": np.ones((2, 3))}, "'score' must have a kind"),
-        ({"camera_intrinsics": np.ones((2, 4))}, "the camera must have model, image_size; got none"),
-        (ct.data.to_columns(two) | {"camera_model": ["x"] * 2}, "one of brown_conrady, .*; got 'x'"),
+        ({"camera_intrinsics": np.ones((2, 4))}, r"the camera must have model; got none. ct.data.to_columns makes all"),
+        ({"camera_intrinsics": np.ones((2, 4)), "camera_model": ["x"] * 2}, "one of brown_conrady, .*; got 'x'"),
     ):
         with pytest.raises(ValueError, match=message):
             function({name: some[name] for name in ("path", "image")} | change)
@@ -256,3 +258,90 @@ def test_wrong_batches_are_told():
     for transform, message in ((linear, says), (ground, "must move labels too; got BirdsEye")):
         with pytest.raises(TypeError, match=message):
             ct.data.MapBatches(transform)
+
+
+def write_shards(folder, some, count):
+    paths = [folder / f"{count}-{i}.tar" for i in range(count)]
+    for i, path in enumerate(paths):
+        with wds.TarWriter(str(path)) as tar:
+            for row in some[i::count]:
+                labels = {name: row[name].tolist() for name in ("keypoints", "boxes", "gaze", "head_pose")}
+                labels |= {"name": "somebody", "keypoints_valid": [True, False, True]}
+                entries = {"__key__": row["path"].removesuffix(".jpg"), "png": row["image"], "json": labels}
+                tar.write(entries | {"mask.png": row["mask"].astype(np.uint8), "cls": row["label"]})
+    return [str(path) for path in paths]
+
+
+def moved_shards(paths, **options):
+    read = wds.autodecode.imagehandler("l8")
+    handlers = [wds.handle_extension("mask.png", lambda data: np.asarray(read("png", data)))]
+    shards = wds.WebDataset(paths, shardshuffle=False, empty_check=False).decode(*handlers, "rgb8")
+    function = ct.data.MapSamples(augmentation(**options), seed=2)
+    return {sample["__key__"]: sample for sample in shards.map(function)}
+
+
+# webdataset leaves that to the collector
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+def test_shards_are_the_same_however_they_are_divided(tmp_path):
+    some = rows()
+    whole, parts = (moved_shards(write_shards(tmp_path, some, count)) for count in (1, 3))
+    assert whole.keys() == parts.keys()
+    transform = camtorch.augment.numpy.Transform(augmentation())
+    for row in some:
+        key = row["path"].removesuffix(".jpg")
+        sample = whole[key]
+        assert {name for name in sample if not name.startswith("__")} == {"png", "mask.png", "json", "cls"}
+        fields = {name: row[name] for name in ("image", "mask", "gaze", "head_pose")}
+        fields["keypoints"] = row["keypoints"].astype(np.float64)
+        alone = transform(fields, generator=ct.data.generator(key, seed=2))
+        assert np.array_equal(sample["png"], alone["image"])
+        assert np.array_equal(sample["mask.png"], alone["mask"])
+        assert sample["mask.png"].ndim == 2
+        assert sample["json"]["keypoints"] == alone["keypoints"].tolist()
+        assert sample["json"]["keypoints_valid"] == (alone["keypoints_valid"] & [True, False, True]).tolist()
+        assert np.array_equal(sample["png"], parts[key]["png"])
+        assert json.dumps(sample["json"]) == json.dumps(parts[key]["json"])
+        assert sample["json"]["name"] == "somebody"
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+def test_what_comes_out_is_written_and_read_again(tmp_path):
+    (path,) = write_shards(tmp_path, rows(2), 1)
+    moved = moved_shards([path], valid_mask=True)
+    with wds.TarWriter(str(tmp_path / "new.tar")) as tar:
+        for sample in moved.values():
+            tar.write(sample)
+    back = {s["__key__"]: s for s in wds.WebDataset(str(tmp_path / "new.tar"), shardshuffle=False).decode("rgb8")}
+    for key, sample in moved.items():
+        assert np.array_equal(back[key]["png"], sample["png"])
+        assert np.array_equal(back[key]["image_valid.npy"], sample["image_valid.npy"])
+        assert back[key]["json"] == sample["json"]
+        entries = {"__key__": key, "png": sample["png"], "json": sample["json"]}
+        again = ct.data.MapSamples(augmentation(camera=None))(entries)
+        assert again["json"]["camera"]["model"] == "kannala_brandt"
+
+
+def test_wrong_samples_are_told():
+    function = ct.data.MapSamples(augmentation())
+    sample = {"__key__": "a", "jpg": rows(1)[0]["image"], "json": {}}
+    for change, message in (
+        ({"jpg": b"JFIF"}, r'jpg must be decoded; got bytes. Add .decode\("rgb8"\) before .map'),
+        ({"jpg": torch.zeros(3, *SIZE)}, "jpg must be a numpy array; got Tensor"),
+        ({"json": b"{}"}, "json must be an object of labels; got bytes. Add .decode"),
+        ({"left.png": sample["jpg"][..., 0]}, "left.png must have a kind; got none. Pass fields={'left.png': KIND}"),
+        ({"left.png": sample["jpg"]}, "'left' must have a kind, .* fields={'left': KIND}"),
+        ({"png": sample["jpg"]}, "png and jpg both hold image"),
+        ({"json": {"keypoints": [[1, 2], [3]]}}, "keypoints must be numbers in lists of one length"),
+        ({"json": {"keypoints": [[10**400, 2]]}}, "keypoints must be numbers in lists of one length"),
+        ({"json": {"scores": [0.5]}}, "'scores' must have a kind"),
+        ({"json": {"camera": {"model": "pinhole"}}}, "the camera must have intrinsics"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=message):
+            function(sample | change)
+    with pytest.raises(ValueError, match="must have '__key__'; got jpg"):
+        function({"jpg": sample["jpg"]})
+    with pytest.raises(TypeError, match=r"must be a dict of entries, before .to_tuple; got tuple"):
+        function(("jpg",))
+    function = ct.data.MapSamples(augmentation(), fields={"nose": "keypoints"})
+    empty = function(sample | {"json": {"keypoints": [], "polygons": [], "boxes": None, "nose": []}})
+    assert (empty["json"]["keypoints"], empty["json"]["polygons"], empty["json"]["boxes"]) == ([], [], None)

@@ -182,6 +182,7 @@ WRONG = [
     (lambda: ct.data.from_columns({}), ValueError, r"from_columns: .*must hold camera_model, .*got none"),
     (lambda: ct.data.MapBatches(WARP, key=7), TypeError, r"MapBatches: key must be the name of a column.*got 7"),
     (lambda: ct.data.MapBatches(ct.Warp(BATCH, BATCH)), ValueError, r"the warp must be a single one; got batch dims"),
+    (lambda: ct.data.MapSamples(WARP, key=[]), TypeError, r"MapSamples: key must name an entry of a sample; got \[\]"),
     (lambda: ct.fit("mei", PIXELS, RAYS, weights=torch.ones(3)), ValueError, r"weights must broadcast against the"),
     (lambda: ct.fit("mei", PIXELS, RAYS, weights=-torch.ones(SIZE)), ValueError, r"weights must be .*got down to -1"),
     (lambda: ct.losses.rays(CAMERA, torch.zeros(3)), TypeError, r"target must be a Camera; got Tensor"),
