@@ -95,16 +95,17 @@ class Compose(Augmentation):
                     )
             drawn, later = {key.rpartition(".")[2] for key in part.ranges}, parts[i + 1 :]
             coloured = {"chromatic", "vignetting", "cos4"} & drawn
+            kind = type(part).__name__
             for wrong, reason in (
-                ("shift_x" in drawn, "have no shift, which needs depth; call it before"),
-                ("rates" in drawn and later, "end with the rolling shutter, or later parts move its rows"),
+                ("shift_x" in drawn, f"have no shift, which needs depth: {kind} goes before"),
+                ("rates" in drawn and later, f"move no rows of a rolling shutter: {kind} goes last"),
                 (
                     coloured and any(one.needs_camera and not one.keeps_lens for one in later),
                     f"be edits after {' and '.join(sorted(coloured))}, which another lens would show",
                 ),
             ):
                 if wrong:
-                    raise ValueError(f"{self._name}: parts must {reason}; got {type(part).__name__} at place {i}")
+                    raise ValueError(f"{self._name}: parts must {reason}; got {kind} at place {i}")
 
     @property
     def parts(self) -> list[Augmentation]:

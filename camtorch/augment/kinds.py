@@ -274,7 +274,7 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
                 ". Rotations R (..., 3, 3) go in as torch.nn.functional.pad(R, (0, 1)), with zeros for the place; "
                 "R = ct.head_rotation(angles), of pitch, yaw and roll in radians"
             )
-        if kind in ("boxes", "keypoints", "landmarks") and dims == 1:
+        if kind in ("boxes", "keypoints", "landmarks") and dims == 1 and value.shape[-1] in field.last:
             hint = f". A single one for each sample goes in as {name}[..., None, :]"
         if kind == "image" and value.ndim == 5:
             hint = f". The frames of clips go in as a batch, by {name}.flatten(0, 1)"

@@ -230,8 +230,11 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
     if not rig.cameras:
         raise ValueError(f"{path}: rig must have a camera; got none")
     for name, camera in rig.cameras.items():
-        if not camera.key:  # as of a Mixed
-            raise TypeError(f"{path}: {name} must be of one model with a key; got {type(camera).__name__}")
+        if camera.is_mixed:
+            by_name = "ct.Rig({f'camera{i}': one for i, one in enumerate(camera)})"
+            raise TypeError(f"{path}: {name} must be of one model; got a Mixed. Save {by_name}")
+        if not camera.key:
+            raise TypeError(f"{path}: {name} must be of a model with a key; got {type(camera).__name__}")
     format = _known(format, WRITTEN, "written") or _format_of(rig, path)
     if os.path.isdir(path):
         if not (inside := [os.path.join(path, name) for name in WRITTEN[format].in_folder]):
