@@ -40,15 +40,6 @@ class Difference(NamedTuple):
         return float(self.apart[self.both].max()) if bool(self.both.any()) else math.nan
 
     @property
-    def median(self) -> float:
-        """Median distance in pixels over common rays; NaN if there are none."""
-        return float(self.apart[self.both].median()) if bool(self.both.any()) else math.nan
-
-    def within(self, pixels: float) -> float:
-        """Return the part of the image, 0 to 1, with common rays at most `pixels` apart."""
-        return float((self.both & (self.apart <= pixels)).double().mean())
-
-    @property
     def same(self) -> bool:
         """Whether common rays agree up to rounding; False if there are none."""
         return self.largest < _ROUNDING

@@ -73,7 +73,8 @@ class Compose(Augmentation):
             ranges |= {f"{i}.{key}": interval for key, interval in [("apply", Range(0, 1)), *part.ranges.items()]}
         super().__init__(ranges, **options)
         self.augmentations = nn.ModuleList(parts)
-        self.crops = {f"{i}.{key}": index for i, part in enumerate(parts) for key, index in part.crops.items()}
+        crops = {f"{i}.{key}": index for i, part in enumerate(parts) for key, index in part.crops.items()}
+        self.crops: Mapping[str, int] = crops
         self.needs_camera: bool = any(part.needs_camera for part in parts)
         self.drawn_on_host: bool = all(part.drawn_on_host for part in parts)
         self._check_options(parts)

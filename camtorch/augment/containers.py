@@ -72,10 +72,8 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
     if isinstance(cameras, (list, tuple)) and all(isinstance(camera, Camera) for camera in cameras):
         cameras = collate_cameras(cameras)
     if not isinstance(cameras, Camera) or cameras.is_mixed:
-        got = [type(one).__name__ for one in cameras] if isinstance(cameras, list) else type(cameras).__name__
         raise TypeError(
-            "with_cameras: cameras must be a Camera with a batch dim, or single ones of one model and size, in a list; "
-            f"got {got}"
+            f"with_cameras: cameras must be a batch, or a list, of one model and size; got {type(cameras).__name__}"
         )
     result: Any = pytree.tree_map(lambda value: value, params)
     found = [own for _, own in _parts(result) if KIND in own]
@@ -84,10 +82,7 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
     for own in found:
         kinds, kind, batch = own[KIND], kind_of_camera(cameras), tuple(cameras.batch_shape)
         if len(kinds) and kinds[0].tolist() != kind:
-            need, got = (f"{k[1]} coefficients and image_size {tuple(k[2:])}" for k in (kinds[0].tolist(), kind))
-            raise ValueError(
-                f"with_cameras: cameras must be of the params' model, {need}; got {type(cameras).__name__}, {got}"
-            )
+            raise ValueError(f"with_cameras: cameras must be of the params' model and image_size; got {cameras!r:.200}")
         count, clips = len(kinds), int(own.get("video_batch_size", len(kinds)))
         if batch not in ((), (1,), (count,), (clips,)):
             raise ValueError(f"with_cameras: cameras must be {count}, one for each sample; got batch dims {batch}")

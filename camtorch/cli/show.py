@@ -48,7 +48,8 @@ def run(arguments: argparse.Namespace) -> None:
         compared = difference(camera, other)
         line = f"against {against}: {compared}, over {100 * compared.part:.4g} % of the image"
         if compared.part and not compared.same:  # a few rays at the rim may dominate the rms
-            line += f"; median {compared.median:.3g} px, {100 * compared.within(1):.3g} % of the image within 1 px"
+            median, close = compared.apart[compared.both].median(), compared.both & (compared.apart <= 1)
+            line += f"; median {median:.3g} px, {100 * close.double().mean():.3g} % of the image within 1 px"
         print(line)
     if output is not None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -23,7 +23,7 @@ def default_count(model: Model, source: CameraLike, models: Models) -> int:
         return len(source.distortion_names)
     if (steps := _path(type(source), model, models)) is None:
         return model.fit_counts[0] if model.fit_counts else model.default_count
-    needed = {_renamed(name, steps) for name in source.distortion_names}
+    needed = {_carried(source, name, steps)[0] for name in source.distortion_names}
     named = {n: model.names_of(n) for n in range(model.default_count, _MANY)}
     held = {n: len(needed & set(names)) for n, names in named.items() if names}
     return min((n for n, number in held.items() if number == max(held.values())), default=model.default_count)
@@ -38,10 +38,11 @@ def carry_over(
     result = values.new_tensor(model.ideal(len(names))).repeat(len(values), 1)
     lossless = torch.ones(len(values), dtype=torch.bool, device=values.device)
     for i, old in enumerate(source.distortion_names):
-        if (name := _renamed(old, steps)) in names:
+        name, without = _carried(source, old, steps)
+        if name in names:
             result[:, names.index(name)] = values[:, i]
         else:
-            lossless &= values[:, i] == _ideal_value(source, old, steps)
+            lossless &= values[:, i] == without
     return result, lossless
 
 
@@ -69,23 +70,14 @@ def _neighbours(model: Model, models: Models) -> Iterator[Step]:
                 yield general, dict(zip(_all_names(model), names, strict=False))
 
 
-def _renamed(name: str, steps: list[Step]) -> str | None:
-    """Return the name of a coefficient at the end of the path; None if it is lost."""
-    for _, names in steps:
-        if name not in names:
-            return None
-        name = names[name]
-    return name
-
-
-def _ideal_value(source: CameraLike, name: str, steps: list[Step]) -> float:
-    """Return the value at which losing the coefficient changes nothing: the ideal one of the last model with it."""
-    model, known = type(source), source.distortion_names
+def _carried(source: CameraLike, name: str, steps: list[Step]) -> tuple[str | None, float]:
+    """Return a coefficient's name at the end of a path, None if lost; and the value whose loss changes nothing."""
+    model, known, end = type(source), source.distortion_names, name
     for later, names in steps:
-        if name not in names:
-            break
-        model, name, known = later, names[name], _all_names(later)
-    return dict(zip(known, model.ideal(len(known)), strict=True))[name]
+        if end not in names:
+            return None, dict(zip(known, model.ideal(len(known)), strict=True))[end]
+        model, end, known = later, names[end], _all_names(later)
+    return end, dict(zip(known, model.ideal(len(known)), strict=True))[end]
 
 
 def _all_names(model: Model) -> tuple[str, ...]:

@@ -32,10 +32,7 @@ class Exact:
         if not isinstance(warp, Warp):
             raise TypeError(f"{owner}: warp must be a Warp; got {type(warp).__name__}")
         if (count := warp.batch_shape.numel()) != 1:
-            raise ValueError(
-                f"{owner}: warp must be a single one; got a batch of {count}. camera[i] is one of a batch of "
-                "cameras: write each ct.Warp(source[i], target[i], rotation[i])"
-            )
+            raise ValueError(f"{owner}: warp must be a single one, as of camera[i]; got a batch of {count}")
         self.warp = warp
         self.source_size: tuple[int, int] = warp.source._size_for(owner)
         self.target_size: tuple[int, int] = warp.target._size_for(owner)
@@ -108,10 +105,7 @@ class LookupMap:
     def _off(self, exact: Exact) -> Tensor:
         mine, wanted = (self.source_size, self.target_size), (exact.source_size, exact.target_size)
         if mine != wanted:
-            raise ValueError(
-                f"LookupMap.error: map and warp must have the same sizes; got {mine[0]} to {mine[1]}, and "
-                f"{wanted[0]} to {wanted[1]}"
-            )
+            raise ValueError(f"LookupMap.error: map and warp must have the same sizes; got {mine} and {wanted}")
         limits = self.positions.new_zeros(2), self.positions.new_tensor(self.source_size[::-1]) - 1
         off = self.positions.clamp(*limits) - torch.from_numpy(exact.positions).clamp(*limits)
         distance = torch.hypot(*off.unbind(-1)).nan_to_num(math.inf)

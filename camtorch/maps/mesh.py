@@ -71,8 +71,7 @@ class Table(MapFormat):
             raise CameraFileError(
                 path,
                 "mesh",
-                f"positions must not leap, as at the seam of a panorama; got leaps beside {leaps} pixels. A target "
-                "without the seam has a mesh; opencv and onnx hold positions pixel by pixel",
+                f"positions must not leap, as at the seam of a panorama; got leaps beside {leaps} pixels",
             )
         n, m = _counts(step, exact.target_size)
         down, across = np.nonzero(exact.shown)
@@ -156,8 +155,7 @@ def held(path: str, format: str, mesh: Mesh, low: Floats, high: Floats, *, clip:
             path,
             f"{int(lost.sum())} of {int(mesh.needed.sum())} vertices",
             f"must fit in {format}; got x {left:.1f} to {right:.1f}, y {top:.1f} to {bottom:.1f} px of the source. "
-            "Choose a target that shows less beyond the edges of the source's image; or clip=True "
-            "(--clip) clips them, and the report has the error",
+            "clip=True (--clip) clips them, and the report has the error",
         )
     return replace(mesh, nodes=mesh.nodes.clip(low, high))
 

@@ -80,13 +80,10 @@ def plucker(rays: Tensor, valid: Tensor, extrinsics: Extrinsics | None, owner: s
     if extrinsics is None:
         return torch.cat((torch.where(valid[..., None], rays, 0.0), torch.zeros_like(rays)), -1), valid
     if not isinstance(extrinsics, Extrinsics):
-        hint = (
-            ". Pass ct.Extrinsics.from_matrix(T) for a matrix, camera from world, or "
-            "ct.Extrinsics.from_matrix(T).inverse() for a camera's pose, world from camera"
+        raise TypeError(
+            f"{owner}: extrinsics must be ct.Extrinsics, camera from world; got {type(extrinsics).__name__}. "
+            "ct.Extrinsics.from_matrix(T) makes them, and .inverse() of a camera's pose"
         )
-        hint = hint if hasattr(extrinsics, "shape") else ""
-        got = type(extrinsics).__name__
-        raise TypeError(f"{owner}: extrinsics must be ct.Extrinsics, camera from world; got {got}{hint}")
     check_devices(owner, camera=rays, extrinsics=extrinsics.rotation)
     dtype, (height, width) = working_dtype(rays, extrinsics.rotation, extrinsics.translation), rays.shape[-3:-1]
     batch = _broadcast(rays.shape[:-3], extrinsics.batch_shape, "extrinsics", owner)

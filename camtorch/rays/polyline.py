@@ -22,18 +22,12 @@ def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics
     if camera.batch_shape:
         raise ValueError(f"{owner}: camera must be single; got batch dims {tuple(camera.batch_shape)}. Use camera[i]")
     points, _ = as_points(points, "points", 3, torch.Size(), camera._tensors, owner)
-    if points.ndim not in (2, 3) or points.shape[-2] < 2:
-        raise ValueError(
-            f"{owner}: points must be (N, 3), two or more, or (E, N, 3), lines; got shape {tuple(points.shape)}"
-        )
-    if not bool(torch.isfinite(points).all()):
-        raise ValueError(f"{owner}: points must be finite; got {points.detach().tolist()!s:.200}")
+    if points.ndim not in (2, 3) or points.shape[-2] < 2 or not bool(torch.isfinite(points).all()):
+        what = f"shape {tuple(points.shape)}, {points.detach().tolist()!s:.200}"
+        raise ValueError(f"{owner}: points must be finite, (N, 3), two or more, or (E, N, 3), lines; got {what}")
     if extrinsics is not None:
         if not isinstance(extrinsics, Extrinsics) or extrinsics.batch_shape:
-            raise TypeError(
-                f"{owner}: extrinsics must be one Extrinsics, camera from world, as pose.extrinsics of solve_pnp or "
-                f"ct.Extrinsics.from_matrix(matrix); got {type(extrinsics).__name__}"
-            )
+            raise TypeError(f"{owner}: extrinsics must be one Extrinsics, camera from world; got {extrinsics!r:.100}")
         points = extrinsics(points)
     if points.ndim == 3:
         return [curve for line in points for curve in project_polyline(camera, line, None)]

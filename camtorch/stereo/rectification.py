@@ -71,9 +71,13 @@ class Rectification(GeometryModule):
         align: Align,
     ):
         super().__init__()
-        self.source_left, self.source_right, self.extrinsics = source_left, source_right, extrinsics
-        self.camera_left = self.camera_right = camera
-        self.projection, self.vertical, self.align = projection, vertical, align
+        self.source_left = source_left
+        self.source_right = source_right
+        self.extrinsics = extrinsics
+        self.camera_left = camera
+        self.camera_right = camera
+        self.vertical = vertical
+        self.projection, self.align = projection, align
         self._axis, self._memo = int(vertical), Kept()
 
     def _frame(self) -> tuple[Tensor, Tensor, Tensor]:

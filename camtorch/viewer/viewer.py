@@ -26,7 +26,7 @@ from camtorch.io.writing import replacing
 from camtorch.lenses.collection import columns
 from camtorch.models import Splined
 from camtorch.projection.rows import unusable
-from camtorch.values.arguments import check_path
+from camtorch.values.arguments import check_path, no_camera
 from camtorch.values.module import model_of
 
 _SIDE, _QUALITY = 1920, 85  # px of the longer side of a photograph, and of its JPEG file
@@ -86,9 +86,7 @@ def _file(name: str) -> str:
 
 def _describe(camera: Camera) -> dict[str, Any]:
     if not isinstance(camera, Camera) or camera.is_mixed:
-        has_one = isinstance(getattr(camera, "camera", None), Camera)
-        hint = ". Pass rig.camera or one of rig.cameras for a rig" if has_one else ""
-        raise TypeError(f"write_viewer: camera must be a camera of one model; got {type(camera).__name__}{hint}")
+        raise TypeError(f"write_viewer: camera must be a camera of one model; got {no_camera(camera)}")
     if camera.batch_shape:
         shape = tuple(camera.batch_shape)
         raise ValueError(f"write_viewer: camera must be a single one, as camera[0]; got a batch {shape}")

@@ -68,7 +68,6 @@ def as_planes(array: object, name: str, owner: str, size: tuple[int, int] | None
     if not is_known or (len(shape) > 2 and size == shape[-2:]):
         forms = "(H, W, C), (H, W) or (N, H, W, C)" if many else "(H, W, C) or (H, W)"
         hint = f". np.moveaxis({name}, -3, -1) puts channels last" if size == shape[-2:] else ""
-        hint = f". Pass the {shape[0]} images one by one" if len(shape) == 4 and not many and not hint else hint
         hint += f", {name}[..., None] adds one to grey images" if hint and many else ""
         raise ValueError(f"{owner}: {name} must be {forms}; got shape {shape}{hint}")
     return tensor.movedim(-1, -3) if tensor.ndim > 2 else tensor[None]

@@ -13,7 +13,7 @@ from camtorch.evaluate.known import are_plain, known_true
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix
 from camtorch.rays.depth import as_depth, depth_scale
-from camtorch.values.arguments import Numbers, check_devices, one_of
+from camtorch.values.arguments import Numbers, check_devices, one_of, shown
 from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.panorama import off_poles, seam_of
@@ -96,13 +96,8 @@ class Reproject(GeometryModule):
         """
         owner = "Reproject"
         size = self.source._size_for(owner)
-        is_batch = isinstance(images, Tensor) and not images.is_complex() and images.ndim == 4
-        if not is_batch or tuple(images.shape[-2:]) != size:
-            what = f"{images.dtype} {tuple(images.shape)}" if isinstance(images, Tensor) else type(images).__name__
-            raise ValueError(
-                f"{owner}: images must be a tensor (B, C, H, W) of real numbers, of the source's image_size {size}; "
-                f"got {what}"
-            )
+        if not isinstance(images, Tensor) or images.ndim != 4 or tuple(images.shape[-2:]) != size:
+            raise ValueError(f"{owner}: images must be a tensor (B, C, *image_size) of {size}; got {shown(images)}")
         check_devices(owner, images=images, source=self.source.intrinsics)
         given = as_depth(depth, kind, self.target._size_for(owner), owner, self.target.intrinsics.device)
         given = given if given.ndim == 4 else given[None, None]

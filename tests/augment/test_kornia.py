@@ -328,7 +328,7 @@ def test_errors_say_what_is_wrong():
     def given(cameras):
         return lambda: adapter.with_cameras(params, cameras)
 
-    numbers, fit = [90.0, 90.0, 60.0, 40.0], r"5 coefficients and image_size \(96, 128\); got BrownConrady"
+    numbers, fit = [90.0, 90.0, 60.0, 40.0], "of the params' model and image_size; got BrownConrady"
     for call, text in (
         (lambda: aug(images(1, 1, (50, 60))), r"\(96, 128\); got \(50, 60\)"),
         (lambda: mount(None), "camera must be the Camera"),
@@ -341,7 +341,7 @@ def test_errors_say_what_is_wrong():
         (given(own.resize(48, 64)), fit),
         (given(ct.KannalaBrandt(numbers, [0.0] * 4, image_size=SIZE)), "got KannalaBrandt"),
         (given(several(2)), r"must be 3, .*\(2,\)"),
-        (given([own, None]), "must be a Camera"),
+        (given([own, None]), "must be a batch, or a list"),
         (lambda: adapter.with_cameras(affine, own), "those of a camera augmentation"),
         (lambda: aug(images(2), params=params), "must be 3 samples; got 2"),
     ):

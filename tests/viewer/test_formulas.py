@@ -133,7 +133,7 @@ def test_all_lenses_are_in_the_page_within_half_a_pixel():
 @pytest.mark.parametrize(
     ("arguments", "error", "text"),
     [
-        ((ct.Rig({"a": fisheye()}),), TypeError, "rig.camera"),
+        ((ct.Rig({"a": fisheye()}),), TypeError, r"only camera is its .camera"),
         (("camera.yml",), TypeError, "camera of one model; got str"),
         ((fisheye().expand(2),), ValueError, r"a batch \(2,\)"),
         ((ct.Pinhole([100.0, 100.0, 50.0, 50.0]),), ValueError, "image_size"),
