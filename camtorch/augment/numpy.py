@@ -80,7 +80,7 @@ class Transform(FrontEnd):
             sample["camera"] = self.camera
         camera = self.augmentation._held("camera") if sample.get("camera") is None else sample["camera"]
         size = getattr(camera, "image_size", None)
-        given = {"draw": draw, "generator": generator}
+        given: Sample = {"draw": draw, "generator": generator}
         options = {name: value for name, value in given.items() if value is not None}  # a FaceNormalizer has none
         entries = {name: self._entry(name, value, sample, size) for name, value in sample.items()}
         inside = {key: tensor for tensors, _ in entries.values() for key, tensor in tensors.items()}

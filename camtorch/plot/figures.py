@@ -53,7 +53,6 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
 
     The ideal lens has the same intrinsics and coefficients without effect: Kannala-Brandt's is equidistant,
     Brown-Conrady's perspective. Short arrows are drawn longer, by a factor in the title.
-    Points that the ideal lens cannot show have a cross.
 
     Args:
         camera: A single camera with an image size.
@@ -70,30 +69,22 @@ def distortion_field(camera: Camera, ax: Axes | None = None, *, count: int = 21)
     pixels = (inner[1:, 1:] + inner[:-1, :-1]) / 2
     rays, valid = camera.unproject(pixels)
     undistorted, covered = ideal(camera).project(rays)
-    moved = (pixels - undistorted).double()
     edges = draw_frame(ax, height, width)
     dark = camera.unproject(image_lattice(camera, 200, 200))[1].numpy(force=True)
     shade = np.ma.masked_array(np.ones((200, 200)), dark)
     ax.imshow(shade, extent=edges, cmap="Greys", vmin=0, vmax=5, interpolation="nearest", zorder=0)
-    both, lost = valid & covered, valid & ~covered
-    if bool(lost.any()):
-        u, v = pixels[lost].double().T.tolist()
-        ax.plot(u, v, color=GREY, marker="x", markersize=4, linestyle="none", label="beyond the ideal lens")
-        ax.legend(loc="lower right", framealpha=0.8)
-    longer = 1
-    if bool(both.any()):
-        end, along = pixels[both].double(), moved[both]
-        length = torch.linalg.vector_norm(along, dim=-1)
-        longer = magnification(0.7 * step / max(float(length.quantile(0.9)), _NOTHING))
-        if float(length.max()) < _NOTHING:
-            along, length, longer = 0 * along, 0 * length, 1
-        planes = [plane.numpy(force=True) for plane in (*(end - longer * along).T, *(longer * along).T, length)]
-        _bar(ax, draw_arrows(ax, *planes, headwidth=4, headlength=5, zorder=3), length)
     cx, cy = camera.intrinsics[2:].tolist()
     ax.plot([cx], [cy], "+", color=COLOURS[1], markersize=11, markeredgewidth=1.6, zorder=4)
-    times = f", {longer} times as long" if longer > 1 else ""
-    none = bool(both.any()) and not bool(length.any())
-    ax.set_title("no distortion" if none else f"distortion, from the ideal pixel to the actual one{times}")
+    both, title = valid & covered, "no distortion"
+    end, along = pixels[both].double(), (pixels - undistorted)[both].double()
+    length = torch.linalg.vector_norm(along, dim=-1)
+    if len(length) and float(length.max()) > _NOTHING:
+        longer = magnification(0.7 * step / max(float(length.quantile(0.9)), _NOTHING))
+        planes = [plane.numpy(force=True) for plane in (*(end - longer * along).T, *(longer * along).T, length)]
+        _bar(ax, draw_arrows(ax, *planes, headwidth=4, headlength=5, zorder=3), length)
+        times = f", {longer} times as long" if longer > 1 else ""
+        title = f"distortion, from the ideal pixel to the actual one{times}"
+    ax.set_title(title if bool(both.any()) else "no ray in common with the ideal lens")
     return ax
 
 
@@ -129,13 +120,13 @@ def radius_curve(cameras: Camera | Sequence[Camera], ax: Axes | None = None, *, 
             angles, low, _ = _radii(ideal(camera))
             ax.plot(np.degrees(angles), low, "--", color=GREY, linewidth=1, label="ideal", zorder=1)
         if camera.image_size is not None:
-            rays, valid = camera.unproject(image_lattice(camera, 65, 65))
+            pixels = image_lattice(camera, 65, 65)
+            rays, valid = camera.unproject(pixels)
             far = float(angles_from_axis(rays)[valid].max()) if bool(valid.any()) else 0.0
             seen = max(seen, math.degrees(far))
             if i == 0:
                 ax.axvspan(0, seen, color=PALE, zorder=0)
-            corners = image_lattice(camera, 2, 2).flatten(0, 1) - camera.intrinsics[2:]
-            shown = max(shown, float(torch.linalg.vector_norm(corners, dim=-1).max()))
+            shown = max(shown, float(torch.linalg.vector_norm(pixels - camera.intrinsics[2:], dim=-1).max()))
     ax.set_xlim(0, 1.15 * seen or None)
     ax.set_ylim(0, 1.15 * shown or None)  # limits for tangents, which grow without end
     ax.set(xlabel="angle from the axis, degrees", ylabel="distance from the principal point, px")
