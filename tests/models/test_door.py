@@ -166,7 +166,7 @@ WRONG = [
     (lambda: MIXED.convert("fisheye624"), TypeError, r"by_groups\(lambda group: group.convert"),
     (lambda: ct.Mixed.from_matrix(torch.eye(3)), TypeError, r"ct.Mixed\(\[...\]\)"),
     (lambda: ct.Mixed.from_fov(60, image_size=SIZE), TypeError, r"ct.Mixed\(\[...\]\)"),
-    (lambda: ct.save(MIXED, "mixed.json"), TypeError, "must be of one model with a key; got Mixed"),
+    (lambda: ct.save(MIXED, "mixed.json"), TypeError, "must be of one model; got a Mixed"),
     (lambda: MIXED.project(torch.rand(3, 5, 3)), ValueError, r"points must be .* with batch dims \*B = \(2,\)"),
     (lambda: ct.solve_pnp(MIXED, torch.rand(5, 12, 3), torch.rand(2, 12, 2)), ValueError, r"must be \(\) or \(2,\)"),
     (lambda: MIXED.plucker(POSE(torch.rand(3, 3), torch.rand(3, 3))), ValueError, "of extrinsics must broadcast"),
