@@ -155,7 +155,8 @@ def _floors() -> dict[str, float]:
             "ct.Dewarp(c)(np.zeros((720, 1280, 3), np.uint8))"
         ),
     }
-    print_peak = "; import resource; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    # not ru_maxrss, which a child takes over from the process that forked it
+    print_peak = "; print(*(x.split()[1] for x in open('/proc/self/status') if x.startswith('VmHWM')))"
     return {
         name: int(subprocess.run([sys.executable, "-c", code + print_peak], capture_output=True, check=True).stdout)
         / 1e3
