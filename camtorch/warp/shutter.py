@@ -16,8 +16,6 @@ from camtorch.poses.rotations import as_rotation
 from camtorch.values.arguments import (
     Numbers,
     as_batch,
-    as_coordinates,
-    as_known_size,
     as_points,
     as_real,
     as_vectors,
@@ -92,11 +90,6 @@ class RollingShutter(GeometryModule):
             self.put(name, as_own(value), persistent=True)
         self.direction = one_of(direction, DIRECTIONS, "direction", owner)
 
-    def times(self, pixels: Numbers, image_size: tuple[int, int]) -> Tensor:
-        """Return the seconds (*B, *N) from the middle of the readout at which pixels (*B, *N, 2) are seen."""
-        values = as_coordinates(pixels, "pixels", 2, "RollingShutter", self.rates.device)
-        return self._times(self._share(values, as_known_size(image_size, "RollingShutter")), values.ndim)
-
     def rows_of(self, index: list[int]) -> RollingShutter:
         """Return the shutter of these rows of a batch."""
         rates = self.rates[index] if self.rates.ndim == 2 else self.rates
@@ -114,14 +107,10 @@ class RollingShutter(GeometryModule):
         share = share.clamp(-_BEYOND, _BEYOND)
         return -share if self.direction in ("up", "left") else share
 
-    def _times(self, share: Tensor, ndim: int) -> Tensor:
-        """Return the seconds for shares of the readout (...) of points with `ndim` dims."""
-        return share * _lead(self.readout.to(share.dtype), ndim - 1)
-
     def turned(self, rays: Tensor, share: Tensor, sign: float) -> Tensor:
         """Turn rays (*B, *N, 3) of shares (*B, *N) to the readout's middle (sign 1) or from it (-1), by Rodrigues."""
         rates = _lead(self.rates.to(rays.dtype), rays.ndim - 1, 1)
-        wx, wy, wz = ((sign * self._times(share, rays.ndim)).unsqueeze(-1) * rates).unbind(-1)
+        wx, wy, wz = ((sign * share * _lead(self.readout.to(share.dtype), share.ndim)).unsqueeze(-1) * rates).unbind(-1)
         x, y, z = rays.unbind(-1)
         square = wx * wx + wy * wy + wz * wz
         s, c = sinc_root(square), cosc_root(square)

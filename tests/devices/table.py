@@ -128,7 +128,7 @@ CASES |= {
     "Reproject": tried(lambda a, b, e, *i: ct.Reproject(a, b, e)(*i), FISHEYE, BROWN, POSE, IMAGES, DEPTH),
     "PlaneWarp": tried(lambda c, e, *w: warped(ct.PlaneWarp(c, c, e, [0, 0.2, 1], 2.0), *w), BROWN, POSE, *FIELDS),
     "BirdsEye": tried(lambda c, e, i: ct.BirdsEye(c, e, x=(-1, 1), y=(1, 3), resolution=0.1)(i), BROWN, ABOVE, IMAGES),
-    "RollingShutter": tried(lambda s, p: s.times(p, SIZE), SHUTTER, PIXELS),
+    "RollingShutter": tried(ct.RollingShutter.detach, SHUTTER),
     "ShutterWarp": tried(lambda a, b, s, i: ct.ShutterWarp(a, b, shutter=s)(i), FISHEYE, BROWN, SHUTTER, IMAGES),
     "vignetting": tried(lambda c: ct.vignetting(c, 2.0), FISHEYE),
     "views.cube": tried(lambda c, i: (v := views.cube(c, 8)) and (v.valid_masks(), v.back(v(i))), FISHEYE, IMAGES),

@@ -137,7 +137,6 @@ WRONG = [
     (lambda: ct.BirdsEye(CAMERA, DOWN, x=3, y=(0, 1), resolution=1), ValueError, r"BirdsEye: x must be \(from, to\)"),
     (lambda: ct.BirdsEye(CAMERA, DOWN, x=(0, 1), y=(0, 1), resolution=9), ValueError, r"at 9.0 units per pixel"),
     (lambda: ct.Reproject(GRID, CAMERA, POSE), ValueError, r"Reproject: .*extrinsics must have one batch dim"),
-    (lambda: ct.RollingShutter(0.01, [0, 0, 0]).times([0, 0], None), TypeError, r"RollingShutter: image_size must be"),
     (lambda: ct.rectify(GRID, GRID, POSE), ValueError, r"rectify: .*extrinsics must have one batch dim"),
     (lambda: ct.rectify(CAMERA, CAMERA, POSE, fov=(60, 60, 60)), ValueError, r"fov must be horizontal, or .*\(60, 60,"),
     (lambda: ct.rectify(CAMERA, CAMERA, POSE, vertical="no"), TypeError, r"vertical must be True or False; got 'no'"),

@@ -138,12 +138,3 @@ def test_a_scene_that_overtakes_the_rows_is_invalid_and_finite():
         assert torch.isfinite(each.grid()).all()
     moved.sum().backward()
     assert torch.isfinite(rates.grad).all()
-
-
-def test_times_are_those_of_rows():
-    down = shutter()
-    rows = torch.tensor([[5.0, 0.0], [9.0, 119.5], [0.0, 239.0]], dtype=torch.float64)
-    expected = READOUT * torch.tensor([0.5 / 240 - 0.5, 0.0, 0.5 - 0.5 / 240], dtype=torch.float64)
-    assert torch.allclose(down.times(rows, (240, 320)), expected, atol=1e-15)
-    assert torch.equal(shutter(direction="up").times(rows, (240, 320)), -down.times(rows, (240, 320)))
-    assert torch.equal(shutter(readout=-READOUT).times(rows, (240, 320)), -down.times(rows, (240, 320)))
