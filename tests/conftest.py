@@ -3,26 +3,29 @@ import sys
 import warnings
 
 import pytest
-import torch
-from hypothesis import settings
-
-with warnings.catch_warnings():
-    # forward-mode derivatives load it on first use, and it uses the deprecated torch.jit.script
-    warnings.simplefilter("ignore")
-    import torch._decomp.decompositions_for_jvp
-
-# xdist has a process on every core already
-torch.set_num_threads(1)
-
-# the same examples on every machine and in every run; speed is not what these tests are about
-settings.register_profile("camtorch", derandomize=True, deadline=None, max_examples=5, database=None)
-settings.load_profile("camtorch")
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_collection():
-    """Imported modules and tests stay: the garbage collector need not look at them, again and again."""
+def pytest_collection(session):
+    """Prepare torch and hypothesis in each process that runs tests, before it imports them.
+
+    Imported modules and tests stay: the garbage collector need not look at them, again and again.
+    """
+    if session.config.pluginmanager.hasplugin("dsession"):  # xdist's own process waits for the others
+        return (yield)
     gc.disable()
+    import torch
+    from hypothesis import settings
+
+    with warnings.catch_warnings():
+        # forward-mode derivatives load it on first use, and it uses the deprecated torch.jit.script
+        warnings.simplefilter("ignore")
+        import torch._decomp.decompositions_for_jvp
+    # xdist has a process on every core already
+    torch.set_num_threads(1)
+    # the same examples on every machine and in every run; speed is not what these tests are about
+    settings.register_profile("camtorch", derandomize=True, deadline=None, max_examples=5, database=None)
+    settings.load_profile("camtorch")
     collected = yield
     gc.freeze()
     gc.enable()
