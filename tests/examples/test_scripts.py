@@ -100,6 +100,7 @@ def test_the_room_is_measured(tmp_path):
     assert stereo_room.study(*seen, "perspective", (110, 100), wrong).median > 0.024
 
 
+@pytest.mark.slow
 def test_the_car_park_comes_back(tmp_path):
     study = surround_view.study((160, 256), 0.05, 1)
     assert study.valid.double().mean() > 0.95

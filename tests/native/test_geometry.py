@@ -22,7 +22,7 @@ pytestmark = pytest.mark.skipif(not native_available(), reason="the library is n
 
 # one calibration of each model and the others, which take a while
 each_kind = pytest.mark.parametrize("key", slow_unless(KEYS.__contains__, [*KEYS, *(f"{k} others" for k in KEYS)]))
-each_dtype = pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+each_dtype = pytest.mark.parametrize("dtype", slow_unless([torch.float64].__contains__, [torch.float64, torch.float32]))
 
 # no rays, none that a chart may cover, and some that are
 WILD = [[0, 0, 0], [math.nan, 0, 1], [1, math.nan, 1], [math.inf, 0, 1], [0, -math.inf, math.nan], [0, 0, -1]]

@@ -19,8 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.parametrize(
     ("subjects", "arguments", "ours"),
     [
-        (["points", "images", "training"], [], "camtorch"),
-        (["augment", "samples", "calibration"], [], "camtorch"),
+        (["points", "images", "training", "augment", "samples", "calibration"], [], "camtorch"),
         (["training"], ["--no-library"], WITHOUT_LIBRARY),
     ],
 )
