@@ -267,7 +267,7 @@ def table(kept: dict[str, Any]) -> str:
     lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     for name, contestant in CONTESTANTS.items():
         done = len(values(kept, name, "mounts", 0))
-        longer = f"; {contestant.longer} times the steps, seeds: {done}" if contestant.longer > 1 else ""
+        longer = f"; {1000 * contestant.longer:,} steps, seeds: {done}" if contestant.longer > 1 else ""
         cells = [contestant.title + longer]
         for which, test, unit in columns if done else []:
             seeds = values(kept, name, test, which)
@@ -288,10 +288,10 @@ def draw(kept: dict[str, Any], output: str | Path) -> None:
         "400 of one camera": ["plain"],
     }
     panels = {
-        "gaze, degrees": (1, ""),
-        "gaze, degrees; four times the steps": (1, ", longer"),
-        "landmarks, %": (0, ""),
-        "landmarks, %; four times the steps": (0, ", longer"),
+        "gaze, degrees; 1,000 steps": (1, ""),
+        "gaze, degrees; 4,000 steps": (1, ", longer"),
+        "landmarks, %; 1,000 steps": (0, ""),
+        "landmarks, %; 4,000 steps": (0, ", longer"),
     }
     figure, axes = plt.subplots(1, len(panels), figsize=(14, 4.2), layout="constrained")
     for axis, (title, (which, suffix)) in zip(axes, panels.items(), strict=True):
@@ -308,7 +308,7 @@ def draw(kept: dict[str, Any], output: str | Path) -> None:
         axis.set_xscale("log")
         axis.set_xticks([80, 400, 2000, 10000], ["80", "400", "2,000", "10,000"])
         axis.minorticks_off()
-        axis.set_ylim(0, 17 if which == 0 else 13)
+        axis.set_ylim(0, 13 if which else 19)
         axis.set_xlabel("the new cameras' own images")
         axis.spines[["top", "right"]].set_visible(False)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
