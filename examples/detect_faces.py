@@ -3,12 +3,14 @@
 python examples/detect_faces.py examples/photographs/astronaut.jpg --fov 20 -o faces.png
 python examples/detect_faces.py driver.jpg --camera camera.yml --detector dlib -o faces.png
 
+Behind a lens of more than 100 degrees, faces are searched in a ring of views, and landmarks in crops that look at them.
 Needs `pip install mediapipe==0.10.21`, whose wheel has the weights and wants numpy < 2; or dlib, `setuptools<81` and
 face_recognition_models, whose weights were trained on data that excludes commercial use.
 """
 
 import argparse
 import importlib
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -20,6 +22,8 @@ from torch import Tensor
 import camtorch as ct
 
 Sample = dict[str, Any]
+Finder = Callable[[Tensor], Sample]
+VIEWS: dict[str, Any] = {"count": 5, "fov": 75, "size": 1000}  # large: dlib misses faces below 80 pixels
 
 
 class Study(NamedTuple):
@@ -39,12 +43,12 @@ def mediapipe(image: Tensor) -> Sample:
     """Return the landmarks of an image (3, H, W) by MediaPipe."""
     options = {"static_image_mode": True, "max_num_faces": 10, "refine_landmarks": True}
     with importlib.import_module("mediapipe").solutions.face_mesh.FaceMesh(**options) as mesh:
-        return ct.data.from_mediapipe(mesh.process(image.permute(1, 2, 0).numpy()), image.shape[-2:])
+        return ct.data.from_mediapipe(mesh.process(image.permute(1, 2, 0).contiguous().numpy()), image.shape[-2:])
 
 
 def dlib(image: Tensor) -> Sample:
     """Return the landmarks of an image (3, H, W) by dlib."""
-    library, array = importlib.import_module("dlib"), image.permute(1, 2, 0).numpy()
+    library, array = importlib.import_module("dlib"), image.permute(1, 2, 0).contiguous().numpy()
     weights = importlib.import_module("face_recognition_models").pose_predictor_model_location()
     predictor, detector = library.shape_predictor(weights), library.get_frontal_face_detector()
     return ct.data.from_dlib([predictor(array, box) for box in detector(array, 1)])
@@ -52,6 +56,25 @@ def dlib(image: Tensor) -> Sample:
 
 DETECTORS = {"mediapipe": (mediapipe, "mediapipe478"), "dlib": (dlib, "ibug68")}
 """Name -> what finds the landmarks of an image, and the name of their order."""
+
+
+@torch.no_grad()
+def detect(image: Tensor, find: Finder, camera: ct.Camera) -> Sample:
+    """Return the landmarks of an image (3, H, W) of any lens."""
+    if float(camera.fov[0]) < 100:
+        return find(image)
+    views, faces = ct.views.ring(camera, **VIEWS), list[Tensor]()
+    for view, warp in zip(views(image), views.warps, strict=True):
+        boxes, valid = warp.inverse().transform_boxes(find(view)["boxes"])  # type: ignore[operator]
+        for box in boxes[valid]:
+            crop = ct.views.look_at(camera, box, (256, 256), margin=0.5)
+            for face in crop.inverse().transform_points(find(crop(image))["keypoints"])[0]:
+                # neighbouring views show the same face
+                if all((face - other).norm(dim=1).mean() > 0.2 * (box[2] - box[0]) for other in faces):
+                    faces.append(face)
+    keypoints = torch.stack(faces) if faces else torch.zeros(0, 0, 2)
+    boxes = torch.cat((keypoints.amin(1), keypoints.amax(1)), -1) if faces else torch.zeros(0, 4)
+    return {"keypoints": keypoints, "boxes": boxes}
 
 
 @torch.no_grad()
@@ -89,7 +112,9 @@ def main(photo: str, out: str, detector: str = "mediapipe", camera: str | None =
     size = (image.shape[1], image.shape[2])
     lens = ct.load(camera).camera if camera else ct.Pinhole.from_fov(fov, image_size=size)
     find, landmarks = DETECTORS[detector]
-    fields = find(image)
+    fields = detect(image, find, lens)
+    if not fields["keypoints"].numel():
+        raise SystemExit(f"{detector} finds no face in {photo}. Try the other --detector")
     found = study(image, fields, landmarks, lens)
     for pose, angles, rms in zip(found.poses, found.angles.tolist(), found.rms.tolist(), strict=True):
         words = "pitch {:.0f}, yaw {:.0f}, roll {:.0f} degrees".format(*angles)

@@ -4,9 +4,9 @@ python examples/real_faces.py -o faces.png
 python examples/real_faces.py windows/*.jpg -o faces.png
 
 Takes square photographs with a face in the middle, by default those of examples/photographs. Needs
-`pip install mediapipe==0.10.21 opencv-python`, which want numpy < 2. A detector finds slightly other landmarks in every
-image, so the same is measured in the image that the nearest similarity makes (`cv2.warpAffine`), and in the one that
-OpenCV makes by the same draw.
+`pip install mediapipe==0.10.21`, which wants numpy < 2 and brings OpenCV. A detector finds slightly other landmarks in
+every image, so the same is measured in the image that the nearest similarity makes (`cv2.warpAffine`), and in the one
+that OpenCV makes by the same draw.
 """
 
 import argparse
