@@ -66,6 +66,20 @@ def test_a_head_is_found_by_landmarks(tmp_path, capsys, monkeypatch):
     torch.testing.assert_close(eyes, torch.tensor([[76.0, 80.0], [146.0, 80.0]]), atol=4, rtol=0)
 
 
+def test_a_face_behind_a_fisheye_is_found_once():
+    def find(image):
+        rows, columns = (image[0] > 128).nonzero().float().unbind(-1)
+        points = torch.stack((columns, rows), -1)
+        faces = torch.stack((points.amin(0), points.amax(0)))[None] if len(points) else torch.zeros(0, 2, 2)
+        return {"keypoints": faces, "boxes": faces.flatten(1)}
+
+    image = torch.zeros(3, 480, 640, dtype=torch.uint8)
+    image[:, 200:240, 460:500] = 255
+    lens = ct.KannalaBrandt.from_fov(180, image_size=(480, 640)).requires_grad_(False)
+    (face,) = detect_faces.detect(image, find, lens)["keypoints"]
+    torch.testing.assert_close(face.mean(0), torch.tensor([479.5, 219.5]), atol=2, rtol=0)
+
+
 def test_moved_faces_are_those_of_opencv_and_the_page_has_the_numbers():
     pytest.importorskip("cv2")
     image = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)).mul(255)
