@@ -31,10 +31,8 @@ def to_columns(camera: Camera, name: str = "camera") -> dict[str, Any]:
     if not isinstance(camera, Camera):
         raise TypeError(f"to_columns: camera must be a Camera; got {no_camera(camera)}")
     if camera.image_size is None or len(camera.batch_shape) > 1:
-        raise ValueError(
-            "to_columns: the camera must have an image_size and one batch dim at most; got image_size "
-            f"{camera.image_size} and batch dims {tuple(camera.batch_shape)}"
-        )
+        got = f"image_size {camera.image_size} and batch dims {tuple(camera.batch_shape)}"
+        raise ValueError(f"to_columns: the camera must have an image_size and one batch dim at most; got {got}")
     numbers = [t.detach().cpu().numpy() for t in (camera.intrinsics, camera.distortion)]
     batch = tuple(camera.batch_shape)
     rows = [np.broadcast_to(v, (*batch, v.shape[-1])).copy() for v in (*numbers, np.asarray(camera.image_size))]

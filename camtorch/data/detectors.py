@@ -37,10 +37,8 @@ def from_mediapipe(result: Any, image_size: Sequence[int]) -> Sample:
     height, width = as_known_size(image_size, "from_mediapipe")
     known = [name for name in ("multi_face_landmarks", "face_landmarks") if hasattr(result, name)]
     if not known:
-        raise TypeError(
-            "from_mediapipe: result must be one of FaceLandmarker or of mp.solutions.face_mesh, with face_landmarks or "
-            f"multi_face_landmarks; got {shown(result)}"
-        )
+        wanted = "one of FaceLandmarker or of mp.solutions.face_mesh, with face_landmarks or multi_face_landmarks"
+        raise TypeError(f"from_mediapipe: result must be {wanted}; got {shown(result)}")
     faces = getattr(result, known[0]) or []
     faces = [faces] if hasattr(faces, "landmark") else faces  # holistic has one
     rows = [[(p.x * width - 0.5, p.y * height - 0.5) for p in getattr(face, "landmark", face)] for face in faces]
@@ -92,10 +90,8 @@ def from_ultralytics(results: Any) -> Sample:
     """
     found = _listed(results, "boxes", "from_ultralytics", "results", "an Ultralytics model with boxes")
     if len(found) != 1:
-        raise ValueError(
-            f"from_ultralytics: results must be of one image; got {len(found)}. "
-            "[ct.data.from_ultralytics(one) for one in results] takes each"
-        )
+        way = "[ct.data.from_ultralytics(one) for one in results] takes each"
+        raise ValueError(f"from_ultralytics: results must be of one image; got {len(found)}. {way}")
     boxes = _tensor(found[0].boxes.xyxy).reshape(-1, 4) - 0.5
     if (keypoints := getattr(found[0], "keypoints", None)) is None:
         return {"boxes": boxes}

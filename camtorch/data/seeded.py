@@ -52,10 +52,8 @@ def _plain(key: object) -> object:
         return int(key)
     if isinstance(key, str):
         return str(key)
-    raise TypeError(
-        "generator: key must identify a sample on every machine and in every run: an integer, a string or a tuple "
-        f"of them; got {key!r:.60}"
-    )
+    wanted = "identify a sample on every machine: an integer, a string or a tuple of them"
+    raise TypeError(f"generator: key must {wanted}; got {key!r:.60}")
 
 
 class Seeded:
@@ -84,10 +82,8 @@ class Seeded:
     def __init__(self, augmentation: Augmentation | Transform, *, seed: int = 0, epoch: int = 0):
         inner = augmentation.augmentation if isinstance(augmentation, Transform) else augmentation
         if not isinstance(inner, Augmentation):
-            raise TypeError(
-                "Seeded: augmentation must be an Augmentation, or camtorch.augment.numpy's Transform of one; got "
-                f"{type(inner).__name__}"
-            )
+            wanted = "an Augmentation, or camtorch.augment.numpy's Transform of one"
+            raise TypeError(f"Seeded: augmentation must be {wanted}; got {type(inner).__name__}")
         if inner.same_on_batch:
             raise ValueError("Seeded: same_on_batch must be False, because no draw depends on the batch here; got True")
         self.augmentation, self._inner = augmentation, inner
@@ -131,10 +127,8 @@ class Seeded:
             moved = self.augmentation(sample, generator=self.generator(key), **fields)  # type: ignore[arg-type]
             rotation = moved["rotation"]
             if rotation.ndim == 3 and len(rotation) > 1:
-                raise ValueError(
-                    f"Seeded: key must be a list, one for each of {len(rotation)} samples; got {key!r:.60}. A clip "
-                    "of one sample goes in as image[None] with key=[...]"
-                )
+                got = f"{key!r:.60}. A clip of one sample goes in as image[None] with key=[...]"
+                raise ValueError(f"Seeded: key must be a list, one for each of {len(rotation)} samples; got {got}")
             return moved
         if isinstance(self.augmentation, Transform):
             raise TypeError(f"Seeded: key must be a single one for a Transform of arrays; got {key!r:.60}")

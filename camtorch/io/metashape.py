@@ -43,11 +43,9 @@ def read(path: str, content: bytes) -> Rig:
     names = _names(path, sensors)
     cameras = {}
     for sensor, name in zip(sensors, names, strict=True):
-        added = sensor.find("corrections")
-        if added is not None and len(added):
-            Record(path, None, f"sensor {name:.60}").fail(
-                "must have no corrections, as no model here has them; got some. Optimise without additional corrections"
-            )
+        if sensor.find("corrections/*") is not None:
+            reason = "must have no corrections, as no model here has them; got some. Optimise without them"
+            Record(path, None, f"sensor {name:.60}").fail(reason)
         found = sensor.findall("calibration")
         best = next((one for one in reversed(found) if one.get("class") == "adjusted"), found[-1])
         cameras[name] = _camera(Record(path, {"type": sensor.get("type"), **_members(best)}, f"sensor {name:.60}"))
@@ -98,13 +96,9 @@ def _world(path: str, owner: ElementTree.Element) -> tuple[Any, float, Any]:
     """Return rotation, scale and translation to the world of a chunk or a component."""
     transform = owner.find("transform")
     record = Record(path, {} if transform is None else _values(transform), f"{owner.tag}.transform")
-    rotation, scale, translation = np.eye(3), 1.0, np.zeros(3)
-    if "rotation" in record:
-        rotation = np.array(_numbers(record["rotation"], 9)).reshape(3, 3)
-    if "scale" in record:
-        scale = record["scale"].number()
-    if "translation" in record:
-        translation = np.array(_numbers(record["translation"], 3))
+    rotation = np.array(_numbers(record["rotation"], 9)).reshape(3, 3) if "rotation" in record else np.eye(3)
+    scale = record["scale"].number() if "scale" in record else 1.0
+    translation = np.array(_numbers(record["translation"], 3)) if "translation" in record else np.zeros(3)
     poses.check_near(record, [*translation, scale])
     return rotation, scale, translation
 

@@ -66,7 +66,7 @@ def read(path: str | os.PathLike[str], model: str | None = None) -> Camera:
 def read_rig(path: str | os.PathLike[str], model: str | None = None) -> Rig:
     """Return all cameras of such a file, and the pose of a pair, all frozen; raise what `read` raises."""
     check_path(path, "io.opencv.read_rig")
-    if model is not None and (not isinstance(model, str) or model not in MODELS):
+    if model not in (None, *MODELS):
         raise ValueError(f"io.opencv: model must be one of {', '.join(sorted(MODELS))}; got {shown(model)}")
     return parse(Record(path, parse_mapping(path, read_bytes(path))), model).requires_grad_(False)
 
@@ -152,17 +152,13 @@ class _File:
     def model(self, distortion: list[float], stated: tuple[str, ...]) -> str:
         """Return the model if the caller does not name one."""
         if (other := self.find(_OTHER_LENS)) is not None:
-            name = "Write model='kannala_brandt' or --from-model kannala_brandt"
-            self.fail(other, f"must be absent, or the model be named; got a file that may mean another model. {name}")
+            self.fail(other, "may mean another model; got no model=, or --from-model, that names it")
         if "kannala_brandt" in stated:
             return "kannala_brandt"
         if len(distortion) == _FISHEYE_COUNT and not stated:
-            warn(
-                f"{self.record.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model are read as brown_conrady. "
-                "If they come from cv2.fisheye, load them by camtorch.io.opencv.read(path, 'kannala_brandt'); "
-                "on the command line, by --from-model kannala_brandt",
-                AmbiguousModelWarning,
-            )
+            text = f"{self.record.path}: {_FISHEYE_COUNT} coefficients and no fisheye_model are read as brown_conrady. "
+            way = "camtorch.io.opencv.read(path, 'kannala_brandt'), or --from-model kannala_brandt"
+            warn(f"{text}If they come from cv2.fisheye, load them by {way}", AmbiguousModelWarning)
         return "brown_conrady" if distortion else "pinhole"
 
     def pose(self, rotation_key: str, translation_key: str) -> Extrinsics:
@@ -237,7 +233,7 @@ def _add_camera(lossy: Lossy, values: dict[str, Any], name: str, camera: Camera,
 
 
 def _text(suffix: str, values: dict[str, Any]) -> str:
-    """Return numbers, and matrices as lists of rows, in the format of `cv2.FileStorage`: JSON, XML, or else YAML."""
+    """Return numbers, and matrices as lists of rows, as `cv2.FileStorage` writes them: JSON, XML, or else YAML."""
     yaml, xml, whole = ["%YAML:1.0", "---"], ['<?xml version="1.0"?>', "<opencv_storage>"], dict[str, Any]()
     for key, value in values.items():
         if not isinstance(value, list):

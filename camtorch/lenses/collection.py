@@ -80,16 +80,11 @@ class Lens:
             ValueError: If its focal lengths are negative.
         """
         if not self._exists:
-            raise ValueError(
-                f"{self.name}: focal lengths must be positive; got {self.intrinsics[:2]}. Choose another one of "
-                "lenses.search with is_optical True"
-            )
-        made = KannalaBrandt(
-            torch.nn.Parameter(torch.tensor(self.intrinsics, dtype=torch.float64)),  # some are off centre
-            torch.tensor(self.distortion, dtype=torch.float64),
-            image_size=self.image_size,
-        )
-        return made.requires_grad_(False)
+            way = "Choose another one of lenses.search with is_optical True"
+            raise ValueError(f"{self.name}: focal lengths must be positive; got {self.intrinsics[:2]}. {way}")
+        intrinsics, distortion = (torch.tensor(v, dtype=torch.float64) for v in (self.intrinsics, self.distortion))
+        made = KannalaBrandt(torch.nn.Parameter(intrinsics), distortion, image_size=self.image_size)
+        return made.requires_grad_(False)  # a Parameter, as some are off centre
 
     def __repr__(self) -> str:
         height, width = self.image_size
@@ -188,10 +183,8 @@ def find(words: str, *, image_size: Sequence[int] | None = None) -> KannalaBrand
         return found[0].camera()
     if not (fitting := search(words, image_size=size)):
         sizes = sorted({lens.image_size for lens in found})
-        raise ValueError(
-            f"lenses.find: image_size must have an aspect ratio calibrated for {words!r}, (height, width) "
-            f"{', '.join(map(str, sizes[:_SHOWN]))}; got {size}. camera.crop takes a part of one. {GUESS_CAMERA}"
-        )
+        known = f"an aspect ratio calibrated for {words!r}, (height, width) {', '.join(map(str, sizes[:_SHOWN]))}"
+        raise ValueError(f"lenses.find: image_size must have {known}; got {size}. {GUESS_CAMERA}")
     camera = fitting[0].camera()
     return camera if camera.image_size == size else camera.resize(*size)
 

@@ -88,11 +88,8 @@ def lenses_for(size: tuple[int, int], fov: tuple[float, float] | None) -> Lenses
     low, high = fov[0] + _EDGE, fov[1] - _EDGE
     chosen = (wide > low) & (wide < high)
     if not bool(chosen.any()):
-        widest = math.floor(float(wide.max()))
-        raise ValueError(
-            f"fov: must be that of a real lens for (height, width) {size}; got {fov[0]:g} to {fov[1]:g}; the "
-            f"widest shows {widest}. Write fov=(low, high) in degrees"
-        )
+        got = f"{fov[0]:g} to {fov[1]:g}; the widest shows {math.floor(float(wide.max()))}"
+        raise ValueError(f"fov: must be that of a real lens for (height, width) {size}; got {got}")
     return Lenses(found[chosen], distortion[chosen], reach[chosen])
 
 

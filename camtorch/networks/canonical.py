@@ -176,10 +176,8 @@ class CanonicalCamera(SampleTransform):
             scales = self.scale(camera).double().flatten().tolist()
             sizes = {(max(round(height * s), 1), max(round(width * s), 1)) for s in scales}
             if len(sizes) > 1:
-                raise ValueError(
-                    f"{self._name}: image_size must be given for several focal lengths; got None, and sizes "
-                    f"{sorted(sizes)}. image_size=(height, width) cuts or fills them to one"
-                )
+                got = f"None, and sizes {sorted(sizes)}. image_size=(height, width) cuts or fills them to one"
+                raise ValueError(f"{self._name}: image_size must be given for several focal lengths; got {got}")
             size = sizes.pop() if sizes else size
 
         def part(rows: list[int] | None, source: Camera) -> Part:

@@ -171,10 +171,8 @@ def reprojection(
     try:
         off = found - pixels
     except RuntimeError:
-        raise ValueError(
-            f"{owner}: pixels of target and of the points must broadcast; got {tuple(pixels.shape)} and "
-            f"{tuple(found.shape)}"
-        ) from None
+        got = f"{tuple(pixels.shape)} and {tuple(found.shape)}"
+        raise ValueError(f"{owner}: pixels of target and of the points must broadcast; got {got}") from None
     # a point without a pixel has a distance without a gradient
     return _reduce(torch.linalg.vector_norm(off, dim=-1), valid & seen, weights, reduction, owner)
 
@@ -188,9 +186,8 @@ def _check(predicted: Camera, target: Camera, owner: str) -> torch.Size:
     try:
         return broadcast_shapes(*shapes)
     except ValueError:
-        raise ValueError(
-            f"{owner}: batch dims of predicted and target must broadcast; got {tuple(shapes[0])} and {tuple(shapes[1])}"
-        ) from None
+        got = " and ".join(str(tuple(shape)) for shape in shapes)
+        raise ValueError(f"{owner}: batch dims of predicted and target must broadcast; got {got}") from None
 
 
 def _places(

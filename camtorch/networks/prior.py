@@ -73,9 +73,8 @@ def prior_of(
     found = []
     for lens in _lenses(asked):
         if not asked.kind.optics(columns(lens))[0].has_scale:
-            raise ValueError(
-                f"{owner}: model must not be a panorama, or have an axis of its own; got {asked.kind.__name__}"
-            )
+            kind = asked.kind.__name__
+            raise ValueError(f"{owner}: model must not be a panorama, or have an axis of its own; got {kind}")
         numbers = lens.new_tensor([1.0, 1.0, 0.0, 0.0]), *([lens] if len(lens) else [])
         plane = asked.kind(*numbers).requires_grad_(False)
         if given is not None and degrees is None:
@@ -87,28 +86,25 @@ def prior_of(
             ranges = [(longest, given or math.sqrt(longest * shortest), shortest)] if bool(reached.all()) else []
         for longest, focal_length, shortest in ranges:
             if not shortest * (1 - 1e-6) <= focal_length <= longest * (1 + 1e-6):
-                within = f"fov must contain that of the given camera; got {tuple(fov or ())}"
-                raise ValueError(f"{owner}: {within}")
+                raise ValueError(f"{owner}: fov must contain that of the given camera; got {tuple(fov or ())}")
             first, second, third = (_disc(plane, far / f) for f in (longest, focal_length, shortest))
             if first and second and third:
                 found.append(Prior(asked.kind, lens, focal_length, ratio, middle, (first, second, third)))
                 break
+
+    def rank(prior: Prior) -> tuple[int, float]:
+        """Prefer most effective coefficients (the omega of `FOV` has none at 0), then the first, then strong ones."""
+        scales = prior.scales(torch.tensor(prior.discs, dtype=torch.float64))
+        return -int((scales > 0).all(0).sum()), -1.0 if prior is found[0] or not scales.numel() else float(
+            scales.amax()
+        )
+
     if found:
-        # the first, unless coefficients without effect there have one elsewhere, like the omega of `FOV` at 0: then the
-        # one with most effective coefficients, and of these the one whose weakest coefficient has most effect
-        scales = [prior.scales(torch.tensor(prior.discs, dtype=torch.float64)) for prior in found]
-        counts = [int((scale > 0).all(0).sum()) for scale in scales]
-        if counts[0] == max(counts):
-            return found[0]
-        return found[min((i for i, n in enumerate(counts) if n == max(counts)), key=lambda i: float(scales[i].amax()))]
-    who, other = (
-        ("the camera", "a crop's camera") if start is not None else (asked.kind.__name__, "a model that sees further")
-    )
+        return min(found, key=rank)
+    who = asked.kind.__name__ if start is None else "the camera"
     angles = f" with fov={degrees or _FOV}" if degrees or start is None else ""
-    raise ValueError(
-        f"{owner}: {who} must have rays for the corners of images of {image_size}, the principal point moved by up to "
-        f"centre={centre} of them; got none{angles}. Use a narrower fov, a smaller centre, or {other}"
-    )
+    got = f"none{angles} and centre={centre}. Use a narrower fov, a smaller centre, or another model"
+    raise ValueError(f"{owner}: {who} must have rays for the corners of images of {image_size}; got {got}")
 
 
 def _as_fov(fov: Sequence[float] | None, owner: str) -> tuple[float, float] | None:

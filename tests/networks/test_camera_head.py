@@ -217,7 +217,7 @@ REFUSED = [
     ("pinhole", {"centre": 0.7}, "below 0.5"),
     (CAMERAS[0], {"image_size": (48, 64)}, "that of the camera, (480, 640)"),
     (CAMERAS[0], {"fov": (20, 30)}, "must contain that"),
-    (ct.KannalaBrandt([200.0, 200, 320, 240], [-0.2, 0, 0, 0], image_size=SIZE), {}, "a crop's camera"),
+    (ct.KannalaBrandt([200.0, 200, 320, 240], [-0.2, 0, 0, 0], image_size=SIZE), {}, "or another model"),
     ("pinhole", {"fov": 90}, "as (40, 120); got 90"),
 ]
 
