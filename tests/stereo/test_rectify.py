@@ -222,6 +222,10 @@ def test_field_of_view_and_size_are_as_asked(projection):
     assert found.camera_left.fov[0].item() == pytest.approx(100, rel=1e-6)
     both = fisheyes(projection=projection, fov=(86, 57))
     assert both.camera_left.fov[:2].tolist() == pytest.approx([86, 57], rel=0.01)
+    # the height of the view is the default if one angle is given
+    views = [fisheyes(projection=projection, fov=fov).camera_left for fov in (100, None)]
+    wide, default = (view.image_size[0] / view.intrinsics[1].item() for view in views)
+    assert wide == pytest.approx(default, rel=0.01)
 
 
 # -- mrcal's, by numbers that its fork drcal gave; where its image is another, in that image
