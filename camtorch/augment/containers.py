@@ -1,4 +1,4 @@
-"""kornia's containers of camera augmentations: dicts move whole, and params carry the cameras of the samples.
+"""kornia's containers of camera augmentations: dicts move whole, and params carry cameras and boxes of the samples.
 
 kornia passes on fields of a dict that it does not know without a warning. So this module wraps `forward` and `inverse`
 of its containers, how they take boxes, and how they are copied.
@@ -29,7 +29,7 @@ from camtorch.augment.sample import KeepsCamera, Sample, Single, detached, on_sa
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import collate_cameras
 from camtorch.evaluate.private import pytree
-from camtorch.values.arguments import shown
+from camtorch.values.arguments import as_values, check_boxes, shown
 from camtorch.values.module import remade
 
 Params: TypeAlias = dict[str, Tensor]
@@ -56,6 +56,24 @@ class InContainers(KeepsCamera):
         return {n: v.unflatten(0, (clips, -1)) for n, v in kept.items()} if clips else type(fields)(kept)
 
 
+def with_boxes(params: Any, boxes: Tensor) -> Any:
+    """Return params with the boxes (B, 4) that a `BoxCrop` crops, x1, y1, x2, y2, for an augmentation or a container.
+
+    `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_boxes(params, boxes))`.
+
+    Raises:
+        ValueError: If the boxes have another shape or number, or the params are not those of a `BoxCrop`.
+    """
+    given = as_values(boxes, "boxes", "with_boxes")
+    check_boxes(given, "boxes", "with_boxes")
+    result, found = _edited(params, "box", "with_boxes: params must be those of a BoxCrop")
+    for own, name in found:
+        if tuple(given.shape) != (len(own[name]), 4):
+            raise ValueError(f"with_boxes: boxes must be ({len(own[name])}, 4); got {tuple(given.shape)}")
+        own[name] = given
+    return result
+
+
 def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
     """Return params for images whose cameras differ in their numbers, for an augmentation or the list of a container.
 
@@ -75,12 +93,9 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
         raise TypeError(
             f"with_cameras: cameras must be a batch, or a list, of one model and size; got {type(cameras).__name__}"
         )
-    result: Any = pytree.tree_map(lambda value: value, params)
-    found = [own for _, own in _parts(result) if KIND in own]
-    if not found:
-        raise ValueError(f"with_cameras: params must be those of a camera augmentation; got {shown(params)}")
-    for own in found:
-        kinds, kind, batch = own[KIND], kind_of_camera(cameras), tuple(cameras.batch_shape)
+    result, found = _edited(params, KIND, "with_cameras: params must be those of a camera augmentation")
+    for own, name in found:
+        kinds, kind, batch = own[name], kind_of_camera(cameras), tuple(cameras.batch_shape)
         if len(kinds) and kinds[0].tolist() != kind:
             raise ValueError(f"with_cameras: cameras must be of the params' model and image_size; got {cameras!r:.200}")
         count, clips = len(kinds), int(own.get("video_batch_size", len(kinds)))
@@ -90,6 +105,15 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
         for key, numbers in zip(_NUMBERS, (cameras.intrinsics, cameras.distortion), strict=True):
             own[key] = numbers.expand(*(batch or (1,)), -1).repeat_interleave(frames, 0).expand(count, -1)
     return result
+
+
+def _edited(params: Any, name: str, need: str) -> tuple[Any, list[tuple[Params, str]]]:
+    """Return a copy of params, and the dicts in it that hold `name`, each with its key; raise if there are none."""
+    result = pytree.tree_map(lambda value: value, params)
+    found = [(part, key) for _, part in _parts(result) for key in part if key.rpartition(".")[2] == name]
+    if not found:
+        raise ValueError(f"{need}; got {shown(params)}")
+    return result, found
 
 
 def _parts(params: Any, module: nn.Module | None = None) -> Iterator[tuple[nn.Module | None, Params]]:

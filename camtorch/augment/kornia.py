@@ -22,14 +22,15 @@ from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
-from camtorch.augment import compose, edits, random_camera
+from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
-from camtorch.augment.containers import KIND, InContainers, Params, camera_of, kind_of_camera, with_cameras
+from camtorch.augment.containers import KIND, InContainers, Params, camera_of, kind_of_camera, with_boxes, with_cameras
 from camtorch.augment.front_end import check_front_end, check_single
 from camtorch.augment.sample import detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
+from camtorch.evaluate.known import known_false
 from camtorch.values.arguments import as_part, no_camera
 from camtorch.values.dtypes import narrow, widen
 from camtorch.warp.sampling import Mode
@@ -87,11 +88,6 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         camera = augmentation.camera if camera is None else camera
         if not isinstance(camera, Camera):
             raise TypeError(f"{name}: camera must be the Camera of the images; got {no_camera(camera)}")
-        if augmentation.crops:
-            raise ValueError(
-                f"{name}: augmentation must take no boxes, which kornia passes after images; got "
-                f"{type(augmentation).__name__}. Call ct.augment.BoxCrop on the samples before"
-            )
         own_size = check_single(name, camera, (), ". with_cameras gives every sample its own")
         super().__init__(
             p=augmentation.p if p is None else as_part(p, "p", name, "probability"),
@@ -122,6 +118,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
             self.augmentation.tell_of_empty_images(self.camera)
         drawn = self.augmentation.drawn(count, 1.0, self.same_on_batch)
         del drawn["apply"]
+        drawn |= {name: torch.full((count, 4), torch.nan) for name in self.augmentation.crops}
         drawn[KIND] = torch.tensor(self._kind).expand(count, -1).contiguous()
         if "size" in self.flags:
             drawn["output_size"] = torch.tensor(self.flags["size"]).expand(count, -1).contiguous()
@@ -130,10 +127,15 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
     def change(self, params: Params | None = None, device: torch.device | None = None) -> Change:
         """Return the change by params, by default the last: `source`, `target`, `rotation`, `points(...)` and so on."""
         params = self._params if params is None else params
-        own = self.augmentation.ranges
+        own = *self.augmentation.ranges, *self.augmentation.crops
         if missing := [name for name in ("batch_prob", *own) if name not in params]:
             raise ValueError(f"{type(self).__name__}: params must have {', '.join(missing)}; got none. Call it first")
         values = {"apply": self._gate(params), **{name: params[name] for name in own}}
+        if self.augmentation.crops and any(known_false(~values[name].isnan()) for name in self.augmentation.crops):
+            raise ValueError(
+                f"{type(self).__name__}: params must hold boxes, as kornia passes boxes after images; got none. Use "
+                "params = aug.forward_parameters(images.shape), then aug(images, params=with_boxes(params, boxes))"
+            )
         camera = camera_of(params, self.camera, device)
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
         inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
@@ -262,6 +264,7 @@ def _named(wraps: type[Augmentation]) -> type[_Random]:
 RandomMount: type[_Random] = _named(random_camera.RandomMount)
 RandomLens: type[_Random] = _named(random_camera.RandomLens)
 RandomCamera: type[_Random] = _named(random_camera.RandomCamera)
+BoxCrop: type[_Random] = _named(box_crop.BoxCrop)
 Compose: type[_Random] = _named(compose.Compose)
 RandomResizedCrop: type[_Random] = _named(edits.RandomResizedCrop)
 RandomCrop: type[_Random] = _named(edits.RandomCrop)
@@ -271,4 +274,4 @@ Pad: type[_Random] = _named(edits.Pad)
 Rotate90: type[_Random] = _named(edits.Rotate90)
 HorizontalFlip: type[_Random] = _named(edits.HorizontalFlip)
 VerticalFlip: type[_Random] = _named(edits.VerticalFlip)
-__all__ = ["CameraAugmentation", "with_cameras", *(one.__name__ for one in _Random.__subclasses__())]
+__all__ = ["CameraAugmentation", "with_boxes", "with_cameras", *(one.__name__ for one in _Random.__subclasses__())]

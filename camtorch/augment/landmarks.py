@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.change import gated
-from camtorch.values.arguments import as_flag, as_whole, one_of, shown, warn
+from camtorch.values.arguments import as_flag, as_whole, shown, warn
 
 
 def _order(count: int, *runs: tuple[int, int, int]) -> tuple[int, ...]:
@@ -86,25 +86,37 @@ class Table:
 
 def as_table(value: TableLike, owner: str) -> Table:
     """Return the table that a name, an order, or a list of pairs stands for."""
-    if isinstance(value, str) and value in LANDMARKS:
+    if isinstance(value, str):
+        if value not in LANDMARKS:
+            raise ValueError(
+                f"{owner}: landmarks must be one of {', '.join(LANDMARKS)}, an order or a list of pairs; got {value!r}"
+            )
         return Table(LANDMARKS[value], True)
-    items: list[Any] = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
-    are_pairs = all(isinstance(item, Iterable) for item in items)
-    numbers = [as_whole(i, "landmarks", owner) for item in items for i in (item if are_pairs else (item,))]
-    if are_pairs:
-        order = list(range(max(numbers, default=-1) + 1))
-        fits = {len(item) for item in items} == {2} and len({*numbers}) == len(numbers) and min(numbers) >= 0
-        for one, other in zip(numbers[::2], numbers[1::2], strict=True) if fits else ():
+    try:
+        items: list[Any] = list(value)
+    except TypeError:
+        raise TypeError(
+            f"{owner}: landmarks must be one of {', '.join(LANDMARKS)}, an order or a list of pairs; got {shown(value)}"
+        ) from None
+    pairs: list[tuple[int, ...]] = []
+    if items and all(isinstance(item, Iterable) for item in items):
+        pairs = [tuple(as_whole(i, "landmarks", owner) for i in pair) for pair in items]
+        if any(len(pair) != 2 for pair in pairs):
+            raise ValueError(f"{owner}: landmarks must be pairs (left, right); got {value!r}")
+        used = [i for pair in pairs for i in pair]
+        order = list(range(max(used) + 1))
+        for one, other in pairs:
             order[one], order[other] = other, one
+        fits = len(set(used)) == len(used) and min(used) >= 0
     else:
-        order = numbers
+        order = [as_whole(i, "landmarks", owner) for i in items]
         fits = sorted(order) == list(range(len(order))) and all(order[i] == k for k, i in enumerate(order))
-    if not fits:
+    if not fits or not order:
         raise ValueError(
-            f"{owner}: landmarks must be one of {', '.join(LANDMARKS)}, pairs (left, right) that hold no index twice, "
-            f"or the index of each landmark's partner; got {shown(value)}"
+            f"{owner}: landmarks must hold each landmark's partner, whose partner is the landmark itself, or "
+            f"pairs that hold no index twice; got {value!r}"
         )
-    return Table(tuple(order), not are_pairs)
+    return Table(tuple(order), not pairs)
 
 
 # numbers of points that hardly anything else has
@@ -128,7 +140,11 @@ class Mirroring:
         swap_sides: bool,
         owner: str,
     ):
-        self.lateral = "xyz".index(one_of(lateral_axis, ("x", "y", "z"), "lateral_axis", owner))
+        if not isinstance(lateral_axis, str) or lateral_axis not in ("x", "y", "z"):
+            raise ValueError(
+                f"{owner}: lateral_axis must be 'x', 'y' or 'z', of the head's frame; got {shown(lateral_axis)}"
+            )
+        self.lateral = "xyz".index(lateral_axis)
         self.owner = owner
         self.swap_sides: bool = as_flag(swap_sides, "swap_sides", owner)
         self._named: dict[str, Table | None] | None = None
@@ -148,8 +164,9 @@ class Mirroring:
             if meant is not None and count not in _told:
                 _told.add(count)
                 warn(
-                    f"{self.owner}: {name} holds {count} points, which keep their order in a mirror: point 0 is then "
-                    f"on the other side. Pass landmarks={meant}, if that is their order, or landmarks={{}} to keep it"
+                    f"{self.owner}: {name} holds {count} points, and mirrored faces keep their order: point 0 is then "
+                    f"on the other side. Pass landmarks={meant}, if that is their order, or "
+                    "landmarks={} to keep it"
                 )
             return None
         order, own = table.of(count), len(table.order)

@@ -22,7 +22,8 @@ from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.kinds import ALIASES, IMAGES, KINDS, OWN, kind_of
 from camtorch.augment.sample import Sample, Single
 from camtorch.cameras.camera import Camera
-from camtorch.warp.arrays import as_array, as_planes, as_tensor, plain
+from camtorch.evaluate.kept import Kept
+from camtorch.warp.arrays import as_array, as_planes, as_tensor, can_share, plain
 
 _OWNER = "numpy.Transform"
 _VALID = "_valid"
@@ -60,7 +61,7 @@ class Transform(FrontEnd):
 
     def __init__(self, augmentation: Augmentation | FaceNormalizer, camera: Camera | None = None):
         check_front_end(_OWNER, augmentation, Augmentation, FaceNormalizer)
-        self.augmentation, self.camera = augmentation, camera
+        self.augmentation, self.camera, self._forms = augmentation, camera, Kept(16)
 
     def __call__(
         self,
@@ -71,30 +72,76 @@ class Transform(FrontEnd):
         **fields: Any,
     ) -> Sample:
         """Augment a sample: keyword arguments, a dict, or both; see `Augmentation.forward` for the other arguments."""
+        options = {"draw": draw, "generator": generator}
+        return self._moved(self.augmentation.forward, sample, fields, options, self.camera)
+
+    def inverse(
+        self,
+        sample: Mapping[str, Any] | None = None,
+        *,
+        draw: Mapping[str, Tensor] | None = None,
+        camera: Camera | None = None,
+        **fields: Any,
+    ) -> Sample:
+        """Move a sample back, see `Augmentation.inverse`: by the last call's change, or by `draw` and its `camera`."""
+        options = {} if draw is None else {"draw": draw, "camera": self.camera if camera is None else camera}
+        if draw is None and camera is not None:
+            fields["camera"] = camera
+        with torch.no_grad():  # as the camera before may learn
+            return self._moved(self.augmentation.inverse, sample, fields, options)
+
+    def __repr__(self) -> str:
+        return f"Transform({self.augmentation!r})"
+
+    def _moved(
+        self, move: Callable[..., Sample], sample: Any, fields: Sample, options: Sample, otherwise: Camera | None = None
+    ) -> Sample:
         if sample is not None and not isinstance(sample, Mapping):
             raise TypeError(
                 f"{_OWNER}: sample must be a dict, or keywords as in transform(image=...); got {type(sample).__name__}"
             )
         sample = {**(sample or {}), **fields}
-        if sample.get("camera") is None and self.camera is not None:
-            sample["camera"] = self.camera
+        if sample.get("camera") is None and otherwise is not None:
+            sample["camera"] = otherwise
         camera = self.augmentation._held("camera") if sample.get("camera") is None else sample["camera"]
         size = getattr(camera, "image_size", None)
-        given: Sample = {"draw": draw, "generator": generator}
-        options = {name: value for name, value in given.items() if value is not None}  # a FaceNormalizer has none
+        own, form = self.augmentation, _form_of(sample)
+        options = {key: value for key, value in options.items() if value is not None}
+        if form is not None:
+            form = form, size, {**own.fields}, own.mirroring
+            layouts = self._forms((), form, lambda: self._layouts(sample, size))
+            if layouts is not None:
+                learns = not isinstance(camera, Camera) or any(t.requires_grad for t in camera._tensors)
+                return _moved_arrays(move, sample, options, layouts, learns)
         entries = {name: self._entry(name, value, sample, size) for name, value in sample.items()}
         inside = {key: tensor for tensors, _ in entries.values() for key, tensor in tensors.items()}
         with torch.no_grad():
-            moved = self.augmentation.forward(Single(inside), **options)
+            moved = move(Single(inside), **options)
         result = {name: to(moved) for name, (tensors, to) in entries.items() if tensors.keys() <= moved.keys()}
         for name in moved.keys() - inside.keys():
             value = plain(moved[name]) if isinstance(moved[name], Tensor) else moved[name]
-            flat = name.endswith(_VALID) and value.ndim == 3 and self._kind(name, value, sample) in IMAGES
+            flat = name.endswith(_VALID) and self._kind(name, value, sample) in IMAGES
             result[name] = value[0] if flat else value
         return result
 
-    def __repr__(self) -> str:
-        return f"Transform({self.augmentation!r})"
+    def _layouts(self, sample: Sample, size: tuple[int, int] | None) -> list[tuple[str, int | None]] | None:
+        """Return fields with the dims of image arrays, 0 for labels, None for others; None if a field needs more."""
+        layouts: list[tuple[str, int | None]] = []
+        mirroring = self.augmentation.mirroring
+        for name, value in sample.items():
+            kind = None if name in OWN or value is None else self._kind(name, value, sample)
+            if kind is None and (mirroring is None or name not in mirroring.by_name):
+                layouts.append((name, None))
+            elif kind is None or name.endswith(_VALID) or not isinstance(value, np.ndarray) or not can_share(value):
+                return None
+            elif kind in IMAGES and name not in ALIASES:
+                as_planes(value, name, _OWNER, size)
+                layouts.append((name, value.ndim))
+            elif kind not in IMAGES and value.dtype.kind == "f":
+                layouts.append((name, 0))
+            else:
+                return None
+        return layouts
 
     def _kind(self, name: str, value: Any, sample: Mapping[str, Any]) -> str | None:
         """Return the kind of a field, or of the field whose validity it is; None if it is not moved."""
@@ -128,6 +175,51 @@ class Transform(FrontEnd):
         tensors = {f"{key}[{i}]": as_planes(one, f"{name}[{i}]", _OWNER, size) for i, one in enumerate(value)}
         to = list if many else np.stack
         return tensors, lambda moved: to([as_array(moved[k], one) for k, one in zip(tensors, value, strict=True)])
+
+
+def _form_of(sample: Sample) -> tuple[Any, ...] | None:
+    """Return a key of all but the arrays' values; None if an array is read-only, or a value is of another kind."""
+    parts: list[Any] = []
+    for name, value in sample.items():
+        if type(value) is np.ndarray:
+            if not value.flags.writeable:
+                return None
+            parts += name, value.dtype, value.shape, value.strides
+        elif value is None or isinstance(value, (str, int, float, Camera)):
+            parts += name, type(value)
+        else:
+            return None
+    return tuple(parts)
+
+
+def _moved_arrays(
+    move: Callable[..., Sample], sample: Sample, options: Sample, layouts: list[tuple[str, int | None]], learns: bool
+) -> Sample:
+    """Move a sample whose arrays torch can read without a copy; see `Transform._layouts`.
+
+    learns: whether the camera may require grad; the sample is then moved without gradients.
+    """
+    given = Single()
+    for name, dims in layouts:
+        value = sample[name]
+        if dims is not None:
+            value = torch.from_numpy(value)
+            value = value.permute(2, 0, 1) if dims == 3 else value[None] if dims == 2 else value
+        given[name] = value
+    with torch.no_grad() if learns else contextlib.nullcontext():
+        moved = move(given, **options)
+    result: Sample = {}
+    for name, dims in layouts:
+        if name in moved:
+            value = moved[name] if dims is None else moved[name].numpy()
+            result[name] = (
+                np.ascontiguousarray(value.transpose(1, 2, 0)) if dims == 3 else value[0] if dims == 2 else value
+            )
+    for name, value in moved.items():
+        if name not in given:
+            value = value.numpy() if isinstance(value, Tensor) else value
+            result[name] = value[0] if name.endswith(_VALID) and value.ndim == 3 else value
+    return result
 
 
 def _numbers(value: Any, name: str, kind: str | None) -> Any:

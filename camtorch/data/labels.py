@@ -7,6 +7,8 @@ import json
 import operator
 import os
 import re
+import struct
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -60,9 +62,9 @@ class Samples(Dataset[Sample]):
 
     def __getitem__(self, index: int) -> Sample:
         sample = self._sample(self, self._entries[operator.index(index)])
-        if (path := sample.get("path")) is not None:
-            sample |= {"image": _image_at(path), "path": str(path)}
-        return sample
+        return (
+            sample | {"image": _image_at(sample["path"]), "path": str(sample["path"])} if "path" in sample else sample
+        )
 
     def __iter__(self) -> Iterator[Sample]:
         return map(self.__getitem__, range(len(self)))
@@ -119,13 +121,14 @@ _ATTRIBUTES = ("pose", "expression", "illumination", "make_up", "occlusion", "bl
 def _wflw_sample(samples: Samples, entry: tuple[str, bytes]) -> Sample:
     place = f"{samples.path}, {entry[0]}"
     if len(words := _text(entry[1], place).strip().split(maxsplit=206)) not in (197, 207):
-        what = "98 points, a box, six attributes and a name, or 197 without box and attributes"
-        raise ValueError(f"{place}: must be 207 words, {what}; got {len(words)}")
+        what = "must be 207 words, 98 points, a box, six attributes and the name of an image"
+        raise ValueError(f"{place}: {what}, or 197 without box and attributes; got {len(words)}")
     sample: Sample = {"keypoints": _numbers(words[:196], place, "points", 98, 2)}
     if len(words) == 207:
+        if not set(words[200:206]) <= {"0", "1"}:
+            raise ValueError(f"{place}: attributes must be 0 or 1; got {' '.join(words[200:206])}")
         sample["boxes"] = _numbers(words[196:200], place, "a box", 1, 4)
-        attributes = _numbers(words[200:206], place, "attributes").int().tolist()
-        sample["attributes"] = dict(zip(_ATTRIBUTES, attributes, strict=True))
+        sample["attributes"] = dict(zip(_ATTRIBUTES, map(int, words[200:206]), strict=True))
     return {**sample, "path": _find(samples, place, words[-1], ("WFLW_images", "images"))}
 
 
@@ -144,16 +147,15 @@ def _pts_sample(samples: Samples, path: Path) -> Sample:
     lines = [(i, line) for i, line in enumerate(body.split("\n"), head.count("\n") + 1) if line.strip()]
     points = [_numbers(line.split(), f"{path}, line {i}", "a point", 2) for i, line in lines]
     if len(points) != 68 or not end:
-        last = lines[-1][0] if lines else 1
-        raise ValueError(f"{path}, line {last}: must have 68 points and }}; got {len(lines)}, and {end or 'none'}")
+        cut = "" if end else " and no }: the file is cut short"
+        raise ValueError(f"{path}, line {lines[-1][0] if lines else 1}: must have 68 points; got {len(lines)}{cut}")
     return {"keypoints": torch.stack(points) - 1, "path": _find(samples, path, path.stem, (), _SUFFIXES)}
 
 
 def _mat_sample(samples: Samples, path: Path) -> Sample:
     arrays = _matlab(path)
-    shapes = {name: array.shape for name, array in arrays.items()}
-    points = [arrays[name][:2].T for name in ("pt2d", "pt3d_68") if shapes.get(name) in ((2, 68), (3, 68))]
-    pose = arrays.get("Pose_Para", np.zeros(0)).ravel()
+    points = [array[:2].T for name in ("pt2d", "pt3d_68") if (array := arrays.get(name, _NONE)).shape[1:] == (68,)]
+    pose, shapes = arrays.get("Pose_Para", _NONE).ravel(), {name: array.shape for name, array in arrays.items()}
     if not points or pose.size != 7:
         raise ValueError(f"{path}: must hold pt2d (2, 68) or pt3d_68 (3, 68), and Pose_Para (1, 7); got {shapes}")
     # 3DDFA's matrix is Rx(-pitch) Ry(-yaw) Rz(-roll) in its own frame, y up and z out of the image
@@ -164,17 +166,43 @@ def _mat_sample(samples: Samples, path: Path) -> Sample:
 
 
 _NONE = np.zeros(0)
+_MATRIX, _COMPRESSED, _LARGEST = 14, 15, 1 << 26  # bytes of a file; those of 300W-LP have some thousands
+_TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8", 13: "<u8"}
 
 
 def _matlab(path: Path) -> dict[str, np.ndarray[Any, Any]]:
-    """Return the arrays of numbers of a file of Matlab 5 to 7 by name."""
-    try:
-        from scipy.io import loadmat
-    except ImportError:
-        raise ImportError(f"{path}: files of Matlab need SciPy: pip install scipy") from None
-    with _failing_at(path, "not a whole file of Matlab 5 to 7: ", Exception):
-        content = loadmat(str(path), appendmat=False)
-    return {name: a for name, a in content.items() if isinstance(a, np.ndarray) and a.dtype.kind in "iuf"}
+    """Return the arrays of numbers of a file of Matlab 5 to 7 by name. Source: MAT-File Format, The MathWorks.
+
+    scipy is not used: its reader crashes the process for some damaged files.
+    """
+    with path.open("rb") as file:
+        content = file.read(_LARGEST)
+    if content[:6] != b"MATLAB" or content[126:128] != b"IM":
+        raise ValueError(f"{path}: must be a file of Matlab 5 to 7, of save -v7; got {content[:20]!r}")
+    found = {}
+    with _failing_at(path, "not a whole file of Matlab: ", ValueError, struct.error, zlib.error):
+        for kind, part in _elements(content[128:]):
+            if kind == _COMPRESSED:
+                kind, part = next(_elements(zlib.decompressobj().decompress(part, _LARGEST)), (0, b""))
+            parts = list(_elements(part)) if kind == _MATRIX else []
+            if len(parts) > 3 and parts[3][0] in _TYPES:  # flags, shape, name, numbers
+                shape, numbers = np.frombuffer(parts[1][1], "<i4"), np.frombuffer(parts[3][1], _TYPES[parts[3][0]])
+                found[parts[2][1].decode("latin-1")] = numbers.reshape(shape.tolist(), order="F")
+    return found
+
+
+def _elements(content: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield the kind and the bytes of each element; small ones fit in eight bytes."""
+    at = 0
+    while at < len(content):
+        kind, size = struct.unpack_from("<II", content, at)
+        begin, after = at + 8, at + 8 + size + (0 if kind == _COMPRESSED else -size % 8)
+        if kind >> 16:
+            kind, size, begin, after = kind & 0xFFFF, kind >> 16, at + 4, at + 8
+        if begin + size > len(content):
+            raise ValueError(f"an element must have {size} bytes; got {len(content) - begin}")
+        yield kind, content[begin : begin + size]
+        at = after
 
 
 def _vcd(path: Path) -> Opened:
@@ -260,8 +288,10 @@ def _find(
             for suffix in suffixes:
                 if os.path.isfile(file := f"{root / folder / parts}{suffix}"):  # False, too, for impossible names
                     return Path(file)
-    where = f"{samples.images or roots[0]}" + (f", or in {', '.join(folders)} there or above" if folders else "")
-    raise ValueError(f"{place}: file {name!r:.200} must be in {where}; got none. Pass read(..., images=FOLDER)")
+    where = f" or in {', '.join(map(repr, folders))} there or up to {_UP} folders above" if folders else ""
+    ends = f" with one of {' '.join(suffixes[:4])}" if len(suffixes) > 1 else ""
+    hint = "; got none there. Pass read(..., images=FOLDER)"
+    raise ValueError(f"{place}: file {name!r:.200}{ends} must be in {samples.images or f'{roots[0]}{where}{hint}'}")
 
 
 def _image_at(path: Path) -> Tensor:
@@ -355,7 +385,7 @@ def read(
     Raises:
         ValueError: If a format is unknown, or a file is not of it, cut short or in another encoding, also when a sample
             is read; the text names the file and the place. FileNotFoundError: If the path does not exist. ImportError:
-            If PyAV is missing for videos, `pip install -e ".[video]"`, or SciPy for .mat, `pip install scipy`.
+            If PyAV is missing for videos, `pip install -e ".[video]"`.
     """
     check_path(path, "read")
     found, folder = Path(path), None if images is None else Path(images)
@@ -365,7 +395,7 @@ def read(
         raise FileNotFoundError(f"read: path must exist; got {str(found)!r}")
     if folder is not None and not folder.is_dir():
         raise FileNotFoundError(f"read: images must be a folder; got {str(images)!r}")
-    name = format or _format_of(found)
+    name = _format_of(found) if format is None else format
     if found.is_dir() and name not in ("300w", "300w_lp"):
         raise ValueError(f"read: path must be a file for {name}; got the folder {str(found)!r}")
     return Samples(found, name, folder)

@@ -30,6 +30,10 @@ class ImageFileError(OSError, ValueError):
     """An image file that cannot be read or written. The text names the file and the reason."""
 
 
+class _NoImageFileError(ImageFileError, FileNotFoundError):
+    pass
+
+
 def load_stored(image: Image.Image) -> Image.Image:
     """Return the pixels of an opened but not yet loaded file as they are stored."""
     orientation = image.getexif().get(ORIENTATION) if image.format == "TIFF" else None
@@ -118,5 +122,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             yield image
     except ImageFileError:
         raise
+    except FileNotFoundError as error:
+        raise _NoImageFileError(f"{path}: {error.strerror}") from None
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
         raise ImageFileError(f"{path}: {getattr(error, 'strerror', None) or error}") from None

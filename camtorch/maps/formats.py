@@ -99,7 +99,7 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
         format: One of the formats of `save_map`. Default: found from the content, the name and the description.
 
     Returns:
-        LookupMap: `.positions`, `.valid_mask()`, `.grid()`, `.error(warp)`.
+        LookupMap: `.positions`, `.map_x`, `.map_y`, `.grid()`, `.error(warp)`; called with images it warps them.
 
     Raises:
         CameraFileError: If the file cannot be used; the error says why. OSError: If it cannot be opened. ValueError: If

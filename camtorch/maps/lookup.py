@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
+from camtorch.values.dtypes import narrow, widen
+from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.warp import Warp
 
 Floats = npt.NDArray[np.float64]
@@ -62,8 +66,8 @@ class Exact:
 class LookupMap:
     """A map that was read from a file: the source position of every target pixel.
 
-    Meshes are interpolated as the hardware does. Use it to check a file; `grid_sample` with `grid()` makes the images
-    that a runtime will make.
+    Meshes are interpolated as the hardware does. Use it to check a file, and to see the images that a runtime will
+    make; `Warp` is faster and more exact.
     """
 
     positions: Tensor
@@ -80,6 +84,16 @@ class LookupMap:
         height, width = self.positions.shape[:2]
         return height, width
 
+    @property
+    def map_x(self) -> Tensor:
+        """Columns (H', W') float32, as for `cv2.remap`."""
+        return self.positions[..., 0].float()
+
+    @property
+    def map_y(self) -> Tensor:
+        """Rows (H', W') float32, as for `cv2.remap`."""
+        return self.positions[..., 1].float()
+
     def grid(self) -> Tensor:
         """Return the grid (1, H', W', 2) float32 for `grid_sample(..., align_corners=False)`; -9 means no position."""
         size = self.positions.new_tensor(self.source_size[::-1])
@@ -90,6 +104,27 @@ class LookupMap:
         """Return a mask (1, 1, H', W') bool: True if the pixel shows a part of the source's image."""
         outer = self.positions.new_tensor(self.source_size[::-1]) - 0.5
         return ((self.positions >= -0.5) & (self.positions <= outer)).all(-1)[None, None]  # NaN is nowhere
+
+    def __call__(self, images: Image, mode: str = "bilinear", padding_mode: str = "zeros") -> Image:
+        """Warp images of the source's size, and return the same kind, as `Warp` does; dtypes are kept.
+
+        Integers are exact up to 2^53.
+        `mode` is "nearest", "bilinear" or "bicubic", `padding_mode` "zeros", "border" or "reflection".
+
+        Raises:
+            ValueError: If the images have another shape or size.
+        """
+        size, given = self.source_size, cast("Any", images)
+        if not isinstance(given, Tensor):
+            warp: Any = partial(self, mode=mode, padding_mode=padding_mode)
+            return cast("Image", warped_alike(given, size, "LookupMap", warp))
+        if given.is_complex() or given.is_sparse or given.ndim < 3 or given.shape[-2:] != size:
+            what, form = f"{given.dtype} {tuple(given.shape)}", f"(..., C, {size[0]}, {size[1]})"
+            raise ValueError(f"LookupMap: images must be a dense tensor {form} of real numbers; got {what}")
+        values = widen(given[None].flatten(0, -4))
+        grid = self.grid().to(values).expand(len(values), -1, -1, -1)
+        made = narrow(F.grid_sample(values, grid, mode, padding_mode, align_corners=False), given.dtype)
+        return cast("Image", made.view(*given.shape[:-2], *self.target_size))
 
     def error(self, warp: Warp) -> Tensor:
         """Return the distance (H', W') float64 to a warp in pixels of the source; NaN if the warp shows nothing there.

@@ -2,6 +2,6 @@
 by default new ones, and returns them; `calibration` and `portrait` return a Figure.
 """
 
-from camtorch.plot.figures import calibration, difference, distortion_field, portrait, radius_curve
+from camtorch.plot.figures import calibration, difference, distortion_field, portrait, radius_curve, rig
 
-__all__ = ["calibration", "difference", "distortion_field", "portrait", "radius_curve"]
+__all__ = ["calibration", "difference", "distortion_field", "portrait", "radius_curve", "rig"]

@@ -1,4 +1,4 @@
-"""Plots of cameras, of the difference of two, and of calibrations with their uncertainty."""
+"""Plots of cameras, of the difference of two, of rigs, and of calibrations with their uncertainty."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from camtorch.analysis import numbers
 from camtorch.calibration.rig import RigCalibration
 from camtorch.calibration.verdict import Calibration
 from camtorch.cameras.camera import Camera
+from camtorch.cameras.rig import Rig
 from camtorch.plot.axes import (
     COLOURS,
     GREY,
@@ -31,6 +32,7 @@ from camtorch.plot.axes import (
     require_matplotlib,
     size_of,
 )
+from camtorch.poses.rotations import rotation_matrix
 from camtorch.rays.lattices import angles_from_axis, followed, ideal, image_lattice
 
 if TYPE_CHECKING:
@@ -158,6 +160,50 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     degrees = math.degrees(numbers.angle(compared.rotation))
     turned = f", turned by {degrees:.3g} degrees" if remove_rotation else ""
     ax.set_title(f"{a.key} and {b.key}: {compared}{turned}")
+    return ax
+
+
+@torch.no_grad()
+def rig(rig: Rig, ax: Axes | None = None) -> Axes:
+    """Draw the positions of the cameras of a rig from above, with wedges for the horizontal fields of view.
+
+    The frame is the rig's, z to the top; cameras above each other are drawn from the right, with vertical fields.
+
+    Args:
+        rig: Rig of single cameras; cameras with a pose are shown.
+        ax: Axes; default new ones.
+
+    Raises:
+        ValueError: If no camera has a pose.
+    """
+    ax = axes_or_new(ax)
+    if not (names := [name for name in rig.cameras if name in rig.extrinsics]):
+        raise ValueError(f"plot: rig must have extrinsics; got {list(rig.cameras)} without")
+    places = torch.stack([rig.extrinsics[name].position for name in names]).double().numpy(force=True)
+    spread = np.ptp(places, axis=0)
+    above = spread[1] <= max(spread[0], spread[2])
+    across, up = (0, 2) if above else (2, 1)
+    size = float(spread.max()) or 1.0
+    for name, place, colour in zip(names, places, cycle(COLOURS), strict=False):
+        camera = rig.cameras[name]
+        wide, tall = (1.0, 1.0) if camera.image_size is None else camera.field_of_view[:2].tolist()
+        half = min(math.pi, (wide if above else tall) / 2)
+        turns = np.linspace(-half, half, 49)
+        around, ahead = np.sin(turns), np.cos(turns)
+        arc = np.stack((around, 0 * turns, ahead) if above else (0 * turns, around, ahead), -1)
+        turned = arc @ rotation_matrix(rig.extrinsics[name].rotation).double().numpy(force=True)
+        wedge = place + 0.45 * size * np.concatenate((0 * arc[:1], turned, 0 * arc[:1]))
+        ax.fill(wedge[:, across], wedge[:, up], color=colour, alpha=0.16, linewidth=0, zorder=1)
+        ax.plot(wedge[:, across], wedge[:, up], color=colour, linewidth=0.9, zorder=2)
+        ax.plot(place[across], place[up], "o", color=colour, markersize=6, zorder=3)
+        options: Any = {"textcoords": "offset points", "color": INK, "ha": "center", "va": "top"}
+        ax.annotate(printable(name), place[[across, up]], (0, -7), **options).set_parse_math(False)
+    ax.set_aspect("equal")
+    ax.margins(0.15)
+    if not above:
+        ax.invert_yaxis()
+    title = f"{len(names)} cameras from {'above' if above else 'the right'}"
+    ax.set(xlabel="xyz"[across], ylabel="xyz"[up], title=title)
     return ax
 
 

@@ -14,6 +14,7 @@ from camtorch.evaluate.known import as_own, known_false, values_of
 from camtorch.optics.special import cosc_root, sinc_root
 from camtorch.poses.rotations import as_rotation
 from camtorch.values.arguments import (
+    LEFT,
     Numbers,
     as_batch,
     as_points,
@@ -122,6 +123,14 @@ class RollingShutter(GeometryModule):
         )
         return torch.stack(planes, -1)
 
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *given: Any) -> None:
+        _check_exposure(state_dict.pop(f"{prefix}exposure", None))
+        super()._load_from_state_dict(state_dict, prefix, *given)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        _check_exposure(state["_buffers"].pop("exposure", None))
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+
     def extra_repr(self) -> str:
         """Return the readout, the rates and the direction."""
         readout, rates = map(values_of, (self.readout, self.rates))
@@ -133,6 +142,12 @@ class RollingShutter(GeometryModule):
 def _lead(value: Tensor, ndim: int, inner: int = 0) -> Tensor:
     """Return values (B, ...) shaped for points with `ndim` leading dims; without a batch dim they serve all points."""
     return value if value.ndim == inner else value.reshape(len(value), *[1] * (ndim - 1), *value.shape[1:])
+
+
+def _check_exposure(exposure: Tensor | None) -> None:
+    """Raise if a state of 0.3 has an exposure."""
+    if exposure is not None and known_false(exposure == 0):
+        raise ValueError(f"RollingShutter: the state's exposure must be 0; got {exposure.tolist()}. {LEFT}")
 
 
 class ShutterWarp(MirrorWarp):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from camtorch.values.arguments import (
 from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import GeometryModule, remade, typed_as
 from camtorch.warp.boxes import corners_of
+from camtorch.warp.sampling import Mode
 from camtorch.warp.warp import Warp, as_sized
 
 __all__ = ["FACES", "Views", "cube", "look_at", "ring"]
@@ -46,30 +47,39 @@ class Views(GeometryModule):
     """Pinhole views of one camera's image, all of the camera `view`, as `cube` and `ring` return them.
 
     `views(images)` makes the views, `views.back(...)` joins a network's results for them. `warps[i]` moves
-    points and boxes to view i, `warps[i].inverse()` back; `rotations[i]`, (3, 3), is `ray_view = R ray_camera`.
+    points and boxes to view i, `warps[i].inverse()` back; `rotations[i]`, (3, 3), is `ray_view = R ray_camera`. The
+    `mode` is that of `Warp`; "nearest" for labels, there and back.
     """
 
     rotations: Tensor
     camera: Camera
     view: Pinhole
     names: tuple[str, ...]
+    mode: Mode
     warps: nn.ModuleList
     backs: nn.ModuleList
 
-    def __init__(self, camera: Camera, view: Pinhole, rotations: Tensor, names: tuple[str, ...]):
+    def __init__(
+        self, camera: Camera, view: Pinhole, rotations: Tensor, names: tuple[str, ...], mode: Mode = "bilinear"
+    ):
         super().__init__()
         self.camera, self.view, self.names = as_sized(camera, "camera", "Views"), view, names
+        self.mode = mode
         self.register_buffer("rotations", rotations, persistent=False)
-        self.warps = nn.ModuleList([Warp(camera, view, rotation) for rotation in rotations])
-        self.backs = nn.ModuleList([Warp(view, camera, r.mT, padding_mode="border") for r in rotations])
+        self.warps = nn.ModuleList([Warp(camera, view, rotation, mode=mode) for rotation in rotations])
+        self.backs = nn.ModuleList([Warp(view, camera, r.mT, mode=mode, padding_mode="border") for r in rotations])
 
     def __len__(self) -> int:
         """Return the number of views."""
         return len(self.names)
 
+    def __iter__(self) -> Iterator[Warp]:
+        """Iterate over the warps."""
+        return iter(self.warps)  # type: ignore[arg-type]
+
     def forward(self, images: Any) -> Any:
         """Return the views (..., N, C, S, S) of images (..., C, H, W), or arrays of arrays, or a list of PIL images."""
-        views = [warp(images) for warp in self.warps]
+        views = [warp(images) for warp in self]
         if isinstance(images, Tensor):
             return torch.stack(views, -4)
         return np.stack(views, int(images.ndim == 4)) if isinstance(images, np.ndarray) else views
@@ -81,7 +91,7 @@ class Views(GeometryModule):
 
     def valid_masks(self) -> Tensor:
         """Return (1, N, 1, S, S) bool: whether the camera sees each pixel of the views."""
-        return torch.stack([warp.valid_mask() for warp in self.warps], 1)  # type: ignore[operator]
+        return torch.stack([warp.valid_mask() for warp in self], 1)
 
     @torch.no_grad()
     def weights(self) -> Tensor:
@@ -90,15 +100,20 @@ class Views(GeometryModule):
         ends = pixels.new_tensor([self.view.width, self.view.height])
         ramp = torch.minimum(pixels + 1, ends - pixels).amin(-1)[None, None]
         # weights end one pixel beyond the outermost ones: a ray between two faces is on both
-        whole = torch.cat([warp(ramp, padding_mode="zeros") for warp in self.backs])[:, 0]
+        parts = [warp(ramp, mode="bilinear", padding_mode="zeros") for warp in self.backs]
+        if self.mode == "nearest":  # a fill value at the rim of a view is no label
+            masks = self.valid_masks().unbind(1)
+            parts = [part * warp(mask) for part, warp, mask in zip(parts, self.backs, masks, strict=True)]
+        whole = torch.cat(parts)[:, 0]
         total = whole.sum(0)
         return whole / torch.where(total > 0, total, 1.0)
 
     def back(self, views: Tensor) -> tuple[Tensor, Tensor]:
-        """Join views (..., N, C, S, S), or results for them, in the wide image: their means by weight.
+        """Join views (..., N, C, S, S), or results for them, in the wide image.
 
-        Returns (..., C, H, W) of the same dtype, integers rounded, and valid (1, 1, H, W) bool, or (1, H, W) for one
-        image: a view shows the pixel. Labels have no mean: join their scores instead.
+        Returns (..., C, H, W) of the same dtype, and valid (1, 1, H, W) bool, or (1, H, W) for one image: a view shows
+        the pixel. Views are averaged by their weights, and integers rounded; mode="nearest" takes the pixel of the view
+        with the largest weight, as labels have no mean.
         """
         size = self.view._size_for("Views")
         want = len(self), *size
@@ -108,27 +123,43 @@ class Views(GeometryModule):
             )
         weights = self.weights()[:, None]
         valid = weights.sum(0) > 0
-        parts = [warp(image) for image, warp in zip(widen(views).unbind(-4), self.backs, strict=True)]
-        shares = [torch.where(w > 0, p * w.to(p.dtype), 0.0) for p, w in zip(parts, weights, strict=True)]
-        return narrow(torch.stack(shares).sum(0), views.dtype), valid if views.ndim == 4 else valid[None]
+        valid = valid if views.ndim == 4 else valid[None]
+        images = views if self.mode == "nearest" else widen(views)
+        parts = [warp(image) for image, warp in zip(images.unbind(-4), self.backs, strict=True)]
+        if self.mode != "nearest":
+            shares = [torch.where(w > 0, p * w.to(p.dtype), 0.0) for p, w in zip(parts, weights, strict=True)]
+            return narrow(torch.stack(shares).sum(0), views.dtype), valid
+        result, most = torch.zeros_like(parts[0]), torch.zeros_like(weights[0])
+        for part, weight in zip(parts, weights, strict=True):
+            result, most = torch.where(weight > most, part, result), weight.maximum(most)
+        return result, valid
 
     def extra_repr(self) -> str:
         """Return the names of the views."""
-        return ", ".join(self.names)
+        return f"{', '.join(self.names)}"
 
 
 @hinting("It takes cube(camera, size), with size the sides of a face in pixels")
-def cube(camera: Camera, size: int | None = None) -> Views:
+def cube(camera: Camera, size: int | None = None, *, mode: Mode = "bilinear") -> Views:
     """Return the six faces of a cube around a camera, of 90 degrees each: front, right, back, left, up, down.
 
     The sides of a face have `size` pixels; by default its middle is as fine as the image at the axis.
     """
-    yaws, pitches = torch.tensor([[0, 90, 180, -90, 0, 0], [0, 0, 0, 0, 90, -90]], dtype=torch.float64)
-    return _views(camera, size, math.pi / 2, yaws, pitches, FACES, "cube")
+    angles = torch.tensor([[0, 0], [90, 0], [180, 0], [-90, 0], [0, 90], [0, -90]], dtype=torch.float64)
+    rotations = mount_rotation(angles[:, 0], angles[:, 1], torch.zeros(6, dtype=torch.float64))
+    return _views(camera, size, math.pi / 2, rotations, FACES, mode, "cube")
 
 
 @hinting("It takes ring(camera, count, size=...), with size the sides of a view in pixels")
-def ring(camera: Camera, count: int, *, fov: float | None = None, size: int | None = None) -> Views:
+def ring(
+    camera: Camera,
+    count: int,
+    *,
+    fov: float | None = None,
+    size: int | None = None,
+    pitch: float = 0.0,
+    mode: Mode = "bilinear",
+) -> Views:
     """Return `count` views side by side, from left to right, over a camera's field of view.
 
     Args:
@@ -136,17 +167,20 @@ def ring(camera: Camera, count: int, *, fov: float | None = None, size: int | No
         count: number of views.
         fov: degrees of a view; by default a quarter more than the step from one view to the next.
         size: pixels along the sides of a view; by default its middle is as fine as the image at the axis.
+        pitch: degrees by which all views look up.
+        mode: as in `Warp`.
     """
-    count = as_whole(count, "count", "ring", least=1)
-    step = float(as_sized(camera, "camera", "ring").field_of_view.detach()[..., 0].max()) / count
+    count, pitch = as_whole(count, "count", "ring", least=1), as_number(pitch, "pitch", "ring")
+    seen = float(as_sized(camera, "camera", "ring").field_of_view.detach()[..., 0].max())
+    step = seen / count
     wide = min(_OVERLAP * step, math.radians(150)) if fov is None else math.radians(as_fov(fov, "ring", 180))
     yaws = torch.rad2deg((torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * step)
-    names = tuple(f"{yaw:.4g} degrees" for yaw in yaws.tolist())
-    return _views(camera, size, wide, yaws, torch.zeros_like(yaws), names, "ring")
+    rotations = mount_rotation(yaws, torch.full_like(yaws, pitch), torch.zeros_like(yaws))
+    return _views(camera, size, wide, rotations, tuple(f"{yaw:.4g} degrees" for yaw in yaws.tolist()), mode, "ring")
 
 
 def _views(
-    camera: Camera, size: int | None, fov: float, yaws: Tensor, pitches: Tensor, names: tuple[str, ...], owner: str
+    camera: Camera, size: int | None, fov: float, rotations: Tensor, names: tuple[str, ...], mode: Mode, owner: str
 ) -> Views:
     as_sized(camera, "camera", owner)
     if camera.batch_shape:
@@ -158,8 +192,7 @@ def _views(
     size = as_whole(size, "size", owner, least=1)
     focal, centre = size / 2 / math.tan(fov / 2), (size - 1) / 2
     intrinsics = camera.intrinsics.detach().new_tensor([focal, focal, centre, centre])
-    rotations = mount_rotation(yaws, pitches, torch.zeros_like(yaws)).to(intrinsics)
-    return Views(camera, pinhole(intrinsics, (size, size)), rotations, names)
+    return Views(camera, pinhole(intrinsics, (size, size)), rotations.to(intrinsics), names, mode)
 
 
 @hinting("It takes look_at(camera, boxes, image_size=(height, width)), and perhaps margin")
@@ -197,6 +230,7 @@ def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin
         raise ValueError(f"{owner}: boxes must be one for each camera of one batch dim; got {len(given)} for {batch}")
     size = as_known_size(image_size, owner)
     rows = given if given.ndim == 2 else given.expand(*(batch or (1,)), 4)
+    check_extents(rows, camera, owner)
     intrinsics, rotation = looking_at(camera, rows, size, as_margin(margin, owner), owner)
     if given.ndim == 1 and not batch:
         intrinsics, rotation = intrinsics[0], rotation[0]
@@ -218,27 +252,33 @@ def pinhole(intrinsics: Tensor, size: tuple[int, int]) -> Pinhole:
     return remade(_VIRTUAL, intrinsics=intrinsics, distortion=intrinsics[..., :0], image_size=size)
 
 
+def check_extents(boxes: Tensor, camera: Camera, owner: str) -> None:
+    """Raise a ValueError unless boxes (B, 4) are finite, have an extent, and are on the camera's image."""
+    check_boxes(boxes, "boxes", owner)
+    limits = boxes.new_tensor((camera.width, camera.height)) - 0.5
+    low, high = boxes.split(2, -1)
+    for wrong, what in (
+        (~torch.isfinite(boxes).all(-1), "must be finite"),
+        (~(low < high).all(-1), "must have a width and a height: x1 < x2 and y1 < y2"),
+        (~((low < limits) & (high > -0.5)).all(-1), f"must be on the image, {camera.width} x {camera.height}, in part"),
+    ):
+        if bool(wrong.any()):
+            i = int(wrong.nonzero()[0])
+            raise ValueError(f"{owner}: boxes {what}; got boxes[{i}] = {boxes[i].tolist()}")
+
+
 @torch.no_grad()
 def looking_at(
     camera: Camera, boxes: Tensor, size: tuple[int, int], margin: float, owner: str
 ) -> tuple[Tensor, Tensor]:
-    """Return intrinsics (B, 4) and rotations (B, 3, 3), in float64, of the cameras of `look_at` for boxes (B, 4).
-
-    Raise a ValueError that names the first box that cannot be looked at.
-    """
+    """Return intrinsics (B, 4) and rotations (B, 3, 3), in float64, of the cameras of `look_at` for boxes (B, 4)."""
 
     def refuse(wrong: Tensor, what: str) -> None:
         if bool(wrong.any()):
             i = int(wrong.nonzero()[0])
             raise ValueError(f"{owner}: boxes must {what}; got boxes[{i}] = {boxes[i].tolist()}")
 
-    check_boxes(boxes, "boxes", owner)
     low, high = boxes.detach().double().split(2, -1)
-    limits = low.new_tensor((camera.width, camera.height)) - 0.5
-    refuse(~torch.isfinite(boxes).all(-1), "be finite")
-    refuse(~(low < high).all(-1), "have a width and a height: x1 < x2 and y1 < y2")
-    off = ~((low < limits) & (high > -0.5)).all(-1)
-    refuse(off, f"be on the image, {camera.width} x {camera.height}, in part")
     axis, has_ray = camera.unproject((low + high) / 2)
     refuse(~has_ray, "have a middle that the lens sees")
     axis = axis / axis.norm(dim=-1, keepdim=True)

@@ -143,8 +143,18 @@ def test_samples_without_the_box_are_refused():
         (lambda: crop(image=image), "must have boxes"),
         (lambda: crop(image=image, boxes=boxes), "sample 1 must have a box of index 0; got 0 boxes"),
         (lambda: ct.augment.BoxCrop(SIZE, margin=-0.5), "margin"),
-        (lambda: ct.augment.kornia.CameraAugmentation(crop), "must take no boxes"),
         (lambda: ct.augment.BoxCrop(SIZE, margin=float("nan")), "margin"),
     ):
         with pytest.raises(ValueError, match=text):
             call()
+
+
+def test_kornia_crops_the_same():
+    camera, kornia, images = fisheye(), ct.augment.kornia, torch.rand(1, 3, 480, 640)
+    boxes = sample_of(camera)["boxes"][1].float()
+    aug = kornia.BoxCrop(camera, SIZE)
+    params = aug.forward_parameters(images.shape)
+    with pytest.raises(ValueError, match="with_boxes"):
+        aug(images, params=params)
+    moved = aug(images, params=kornia.with_boxes(params, boxes[None, 0]))
+    torch.testing.assert_close(moved, ct.augment.BoxCrop(SIZE)(image=images, boxes=boxes[None], camera=camera)["image"])

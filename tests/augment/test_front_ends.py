@@ -81,12 +81,20 @@ def test_layouts_lists_and_what_was_valid_before():
     assert (empty.shape, empty.dtype) == ((0, 20, 30), np.uint8)
 
 
-def test_a_draw_and_a_generator_give_the_same():
-    points = images()[2]
+def test_there_and_back():
+    image, _, points, _ = images()
     transform = ct.augment.numpy.Transform(ct.augment.RandomMount(), camera())
+    out = transform(image=image, keypoints=points[:2], gaze=[0.0, 0.6, -0.8])
+    back = transform.inverse(**out)
+    learns = ct.augment.numpy.Transform(ct.augment.RandomMount())
+    assert learns.inverse(learns(image=image.astype(np.float32), camera=camera()))["image"].dtype == np.float32
+    for name, value in (("keypoints", points[:2]), ("gaze", [0, 0.6, -0.8]), ("rotation", np.eye(3))):
+        np.testing.assert_allclose(back[name], value, atol=1e-3 if name == "keypoints" else 1e-6)
     draw = transform.augmentation.draw(1, torch.Generator().manual_seed(5))
     moved = transform(keypoints=points, generator=torch.Generator().manual_seed(5))["keypoints"]
     np.testing.assert_array_equal(moved, transform(keypoints=points, draw=draw)["keypoints"])
+    again = transform.inverse(keypoints=moved[:2], draw=draw)
+    np.testing.assert_allclose(again["keypoints"], points[:2], atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["keypoints", "landmarks"])
@@ -207,18 +215,47 @@ def test_what_has_no_place_keeps_its_row(vision):
     assert (none.shape, masks.shape) == ((0, 4), (0, *SIZE))
 
 
+@pytest.mark.parametrize("form", ["CXCYWHR", "XYWHR", "XYXYXYXY"])
+def test_rotated_boxes_turn_with_their_axis(form, monkeypatch):
+    with torchvision_of("real", monkeypatch) as tv:
+        front_end = importlib.import_module("camtorch.augment.torchvision")
+        functional = importlib.import_module("torchvision.transforms.v2.functional")
+        formats = tv.BoundingBoxFormat
+
+        def corners(boxes):
+            return functional.convert_bounding_box_format(boxes, None, formats.XYXYXYXY).as_subclass(torch.Tensor)
+
+        given = torch.tensor([[16.0, 12.0, 8.0, 4.0, 30.0], [20.0, 9.0, 6.0, 5.0, -100.0], [9e3, 9.0, 6.0, 5.0, 0.0]])
+        given = functional.convert_bounding_box_format(given, formats.CXCYWHR, formats[form])
+        boxes = tv.BoundingBoxes(given, format=formats[form], canvas_size=SIZE)
+        for augment, flip in ((ct.augment.HorizontalFlip, "horizontal"), (ct.augment.VerticalFlip, "vertical")):
+            want = getattr(functional, f"{flip}_flip")(boxes)  # as torchvision itself does it
+            moved = front_end.Transform(augment(p=1))(boxes)
+            torch.testing.assert_close(corners(moved)[:2], corners(want)[:2], rtol=0, atol=1e-4)
+        mount = ct.augment.RandomMount(yaw=15, roll=(40, 40), min_filled=0)
+        transform = front_end.Transform(mount, camera(), valid=True)
+        out = transform({"boxes": boxes, "boxes_valid": torch.tensor([1, 0, 1])})
+        assert out["boxes_valid"].tolist() == [True, False, False]
+        ends = corners(out["boxes"])[:2].unflatten(-1, (4, 2))
+        inside = transform.last.points(corners(boxes)[None, :2].unflatten(-1, (4, 2)) - 0.5)[0][0] + 0.5 - ends[:, :1]
+        across, down = (ends[:, i] - ends[:, 0] for i in (1, 3))
+        assert (across * down).sum(-1).abs().max() < 1e-3
+        for side in (across, down):  # the corners lie in it, on its sides but for the bending of the lens
+            share = (inside * side[:, None]).sum(-1) / (side**2).sum(-1, keepdim=True)
+            assert -1e-5 < share.min() < 0.2
+            assert 0.8 < share.max() < 1 + 1e-5
+
+
 def test_what_would_not_move_or_be_misread_is_refused(vision):
     front_end, tv = vision
     image = torch.zeros(3, *SIZE)
     boxes = tv.BoundingBoxes(torch.tensor([[2.0, 3, 9, 8]]), format=tv.BoundingBoxFormat.XYWH, canvas_size=SIZE)
-    rotated = tv.BoundingBoxes(torch.ones(1, 5), format=tv.BoundingBoxFormat.CXCYWHR, canvas_size=SIZE)
     transform = front_end.Transform(augmentation(), camera())
     two = front_end.Transform(augmentation(), ct.Pinhole(torch.ones(2, 4), image_size=SIZE))
     size = r"KeyPoints must be of the camera's image_size \(24, 32\); got \(5, 6\) \(height, width\)"
     for call, sample, text in (
         (transform, (tv.Image(image), torch.ones(4, 3)), r"'\[1\]' must have a kind.*fields="),
         (transform, (image, image), r"'\[1\]' must have a kind"),
-        (transform, rotated, "boxes must not be rotated; got CXCYWHR"),
         (transform, {"image": image, "target": [torch.ones(3)]}, "'target' must have a kind"),
         (transform, {"image": image, "tvec": torch.ones(2, 4)}, "tvec must be"),
         (transform, {"image": image, "gaze": [0.0, 0.0, 1.0]}, "gaze must be a tensor of real numbers"),

@@ -131,7 +131,7 @@ CASES = [
     for front_end in FRONT_ENDS
     for name in (*AUGMENTATIONS, *(f"{name}, no camera" for name in EDITS))
     for batch in ((), (2,))
-    # batches are for tensors, and kornia's wants a camera and no boxes
+    # batches are for tensors, and kornia's wants a camera, and boxes by `with_boxes`
     if not (batch and front_end in ("arrays", "albumentations"))
     and not (front_end == "kornia" and (name == "a box" or "no camera" in name))
 ]

@@ -280,14 +280,14 @@ def message(path, index=0, format=None):
 WFLW = [
     (lambda s: "\n".join([s[0], "", s[1][:700]]), 1, ", line 3: must be 207 words, 98 points, a box"),
     (lambda s: "\n".join([s[0], "nan " + s[1].partition(" ")[2]]), 1, ", line 2: points must be 98 x 2 finite numbers"),
-    (lambda s: s[0].replace(" 0 0 1 0 0 0 ", " 0 0 x 0 0 0 "), 0, ", line 1: attributes must be finite numbers"),
+    (lambda s: s[0].replace(" 0 0 1 0 0 0 ", " 0 0 2 0 0 0 "), 0, ", line 1: attributes must be 0 or 1"),
     (lambda s: s[0].replace("0--Parade", "../x"), 0, "within the folder of images"),
     (lambda s: s[0].replace("0--Parade", 999 * "x"), 0, "line 1: file 'xxx"),
     (lambda s: s[0].encode("utf-16"), 0, "line 1: not text in UTF-8"),
 ]
 PTS = [
-    (lambda s: s[:300], "must have 68 points and }; got"),
-    (lambda s: s.replace("{\n", "{\n1 2\n"), "line 72: must have 68 points and }; got 69"),
+    (lambda s: s[:300], "the file is cut short"),
+    (lambda s: s.replace("{\n", "{\n1 2\n"), "line 72: must have 68 points; got 69"),
     (lambda s: s.replace("{\n", "{\n1 2 3\n"), "line 4: a point must be 2 finite numbers"),
     (lambda s: "", "line 1: must be version: 1"),
     (lambda s: s.encode() + b"\xe9", "not text in UTF-8"),

@@ -8,6 +8,7 @@ import typing
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 from public_names import FRONT_ENDS, ROOMS, names, public, room_of
 
@@ -93,12 +94,23 @@ def with_rates():
     return augmentation
 
 
-MADE = with_shutter, with_rates
+def with_exposure(seconds=0.01):
+    shutter = ct.RollingShutter(0.03, [0.1, 0.2, 0.3])
+    shutter.register_buffer("exposure", torch.tensor(seconds))
+    return shutter
+
+
+MADE = with_shutter, with_rates, with_exposure
 TYPED |= {f"a pickle {made.__name__}": lambda made=made: copied(made()) for made in MADE}
 
 
 def copied(module):
     return pickle.loads(pickle.dumps(module))
+
+
+def test_a_pickled_shutter_without_an_exposure_loads():
+    shutter = copied(with_exposure(0.0))
+    shutter.load_state_dict(shutter.state_dict())
 
 
 @pytest.mark.parametrize("use", TYPED.values(), ids=TYPED)

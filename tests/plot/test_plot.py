@@ -104,6 +104,23 @@ def test_what_shows_nothing_is_left_out():
         draw(nothing, axes()).figure.canvas.draw()
 
 
+def test_cameras_of_a_rig_are_where_they_are():
+    camera = ct.Pinhole([300.0, 300, 320, 240], image_size=SIZE)
+    poses = {"$left\udc80": ct.Extrinsics([0.0] * 3, [0.0] * 3)}
+    poses["right"] = ct.Extrinsics([0.0, 0.2, 0.0], [-0.1, 0.0, 0.02])
+    rig = ct.Rig(dict.fromkeys(poses, camera), poses)
+    ax = plot.rig(rig, axes())
+    ax.figure.canvas.draw()
+    dots = [(line.get_xdata()[0], line.get_ydata()[0]) for line in ax.lines if line.get_marker() == "o"]
+    expected = [rig.extrinsics[name].position[[0, 2]].tolist() for name in poses]
+    np.testing.assert_allclose(dots, expected, atol=1e-7)
+    assert [text.get_text() for text in ax.texts] == ["$left\N{REPLACEMENT CHARACTER}", "right"]
+    stacked = {"a": poses["$left\udc80"], "b": ct.Extrinsics([0.0] * 3, [0.0, 0.3, 0.0])}
+    assert "from the right" in plot.rig(ct.Rig(dict.fromkeys("ab", camera), stacked), axes()).get_title()
+    with pytest.raises(ValueError, match="rig must have extrinsics; got "):
+        plot.rig(ct.Rig({"a": camera}), axes())
+
+
 def test_the_door():
     batch = ct.Pinhole(torch.ones(2, 4), image_size=SIZE)
     for error, match, *calls in (

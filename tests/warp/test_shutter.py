@@ -138,3 +138,12 @@ def test_a_scene_that_overtakes_the_rows_is_invalid_and_finite():
         assert torch.isfinite(each.grid()).all()
     moved.sum().backward()
     assert torch.isfinite(rates.grad).all()
+
+
+def test_states_of_0_3_load():
+    made = shutter()
+    state = made.state_dict()
+    assert sorted(state) == ["rates", "readout"]
+    other = shutter(rates=(0.0, 0.0, 0.0))
+    other.load_state_dict({**state, "exposure": torch.tensor(0.0)})
+    assert torch.equal(other.rates, made.rates)

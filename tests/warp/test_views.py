@@ -1,6 +1,7 @@
 """One wide image as several pinhole ones, and back again: seamless."""
 
 import math
+from functools import cache
 
 import pytest
 import torch
@@ -19,20 +20,58 @@ def sky(rays):
     return 0.5 + 0.4 * torch.sin(4 * rays).prod(-1)
 
 
-def test_views_without_weight_have_no_part_and_integers_do_not_wrap_around():
-    camera, top = wide((120, 160)), torch.iinfo(torch.int64).max
-    for views in (ct.views.cube(camera), ct.views.ring(camera, 3)):
-        shape, weights = (1, len(views), 1, *views.view.image_size), views.weights()
-        images = torch.rand(shape, generator=torch.Generator().manual_seed(0)).double()
-        expected = views.back(images)[0][0, 0]
-        images[:, 1] = math.inf
-        result = views.back(images)[0][0, 0]
+@cache
+def wholes(mode="nearest"):
+    """What makes one image of several: their count, their size, how, and the weights of each (N, H, W)."""
+    camera = wide((120, 160))
+    views = ct.views.cube(camera, mode=mode), ct.views.ring(camera, 3, mode=mode)
+    return [(len(v), v.view.image_size, v.back, v.weights()) for v in views]
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int32, torch.uint64, torch.int64, torch.float32])
+def test_the_label_of_the_heaviest_view_wins(dtype):
+    for count, size, back, weights in wholes():
+        if dtype == torch.bool:
+            labels = [i % 2 == 0 for i in range(count)]
+        else:  # in 64 bits neighbours that are one float64
+            top = torch.iinfo(dtype).max if not dtype.is_floating_point else 2**24
+            labels = [top - i for i in range(count)]
+        of_each = torch.stack([torch.full((1, 1, *size), label, dtype=dtype) for label in labels], 1)
+        result, valid = back(of_each)
+        assert result.dtype == dtype
+        expected = torch.tensor(labels, dtype=dtype)[weights.argmax(0)]
+        assert torch.equal(result[valid], expected[valid[0, 0]])
+        assert valid.any()
+        assert not result[~valid].any()
+
+
+@pytest.mark.parametrize(("mode", "dtype"), [("bilinear", torch.int64), ("nearest", torch.int32)])
+def test_the_largest_integers_do_not_wrap_around(mode, dtype):
+    top = torch.iinfo(dtype).max
+    for count, size, back, _ in wholes(mode):
+        result, valid = back(torch.full((1, count, 1, *size), top, dtype=dtype))
+        # what the largest integer loses as a float64, and weights in float32
+        assert int(result[valid].min()) >= top - (top * 1e-6 if mode == "bilinear" else 0)
+
+
+@pytest.mark.parametrize(("mode", "bad"), [("bilinear", math.inf), ("nearest", math.nan)])
+def test_a_view_without_weight_has_no_part(mode, bad):
+    for count, size, back, weights in wholes(mode):
+        images = torch.rand(1, count, 1, *size, generator=torch.Generator().manual_seed(0)).double()
+        expected = back(images)[0][0, 0]
+        images[:, 1] = bad
+        result = back(images)[0][0, 0]
         free = weights[1] == 0
         assert torch.equal(result[free], expected[free])
         assert not result[weights.argmax(0) == 1].isfinite().any()
-        result, valid = views.back(torch.full(shape, top))
-        # what the largest integer loses as a float64, and weights in float32
-        assert int(result[valid].min()) >= top * (1 - 1e-6)
+
+
+def test_views_give_no_label_that_is_in_no_image():
+    camera = ct.KannalaBrandt.from_fov(190, image_size=(100, 160)).requires_grad_(False)
+    views = ct.views.cube(camera, mode="nearest")
+    labels, valid = views.back(views(torch.randint(1, 5, (1, 1, 100, 160))))
+    assert valid.float().mean() > 0.99
+    assert (labels[valid] > 0).all()
 
 
 @pytest.mark.parametrize(("kind", "degrees"), [("cube", 190), ("ring", 170)])
