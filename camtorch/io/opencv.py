@@ -152,7 +152,8 @@ class _File:
     def model(self, distortion: list[float], stated: tuple[str, ...]) -> str:
         """Return the model if the caller does not name one."""
         if (other := self.find(_OTHER_LENS)) is not None:
-            self.fail(other, "may mean another model; got no model=, or --from-model, that names it")
+            name = "Write model='kannala_brandt' or --from-model kannala_brandt"
+            self.fail(other, f"must be absent, or the model be named; got a file that may mean another model. {name}")
         if "kannala_brandt" in stated:
             return "kannala_brandt"
         if len(distortion) == _FISHEYE_COUNT and not stated:
