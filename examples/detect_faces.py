@@ -64,7 +64,7 @@ def detect(image: Tensor, find: Finder, camera: ct.Camera) -> Sample:
     if float(camera.fov[0]) < 100:
         return find(image)
     views, faces = ct.views.ring(camera, **VIEWS), list[Tensor]()
-    for view, warp in zip(views(image), views.warps, strict=True):
+    for view, warp in zip(views(image), views, strict=True):
         boxes, valid = warp.inverse().transform_boxes(find(view)["boxes"])  # type: ignore[operator]
         for box in boxes[valid]:
             crop = ct.views.look_at(camera, box, (256, 256), margin=0.5)
