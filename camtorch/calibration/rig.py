@@ -57,6 +57,21 @@ class RigCalibration:
         return {name: camera.std for name, camera in self.cameras.items()}
 
     @property
+    def inliers(self) -> dict[str, Any]:
+        """Inliers by name of the camera, as in `Calibration`."""
+        return {name: camera.inliers for name, camera in self.cameras.items()}
+
+    @property
+    def parameter_names(self) -> dict[str, tuple[str, ...]]:
+        """Names of parameters, by name of the camera."""
+        return {name: camera.parameter_names for name, camera in self.cameras.items()}
+
+    @property
+    def covariance(self) -> dict[str, Tensor]:
+        """Covariances (P, P) of the parameters, by name of the camera."""
+        return {name: camera.covariance for name, camera in self.cameras.items()}
+
+    @property
     def warnings(self) -> list[str]:
         """Warnings of all cameras, each with the camera's name; see `Calibration.warnings`."""
         return [f"{name}: {text}" for name, camera in self.cameras.items() for text in camera.warnings]

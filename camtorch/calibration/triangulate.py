@@ -104,8 +104,11 @@ def _as_list(modules: Sequence[M] | M, name: str, kind: type[M], count: int) -> 
     if isinstance(modules, kind):
         return [modules[i] for i in range(len(modules))] if modules.batch_shape else [modules] * count
     for module in cast(Sequence[M], modules):
-        if not isinstance(module, kind) or module.batch_shape:
-            raise TypeError(f"triangulate: {name} must be single {kind.__name__} in a list; got {shown(module)}")
+        if not isinstance(module, kind):
+            raise TypeError(f"triangulate: {name} must be {kind.__name__} in a list; got {shown(module)}")
+        if module.batch_shape:
+            own = tuple(module.batch_shape)
+            raise ValueError(f"triangulate: {name} must have no batch dims of their own; got one with {own}")
     return list(cast(Sequence[M], modules))
 
 

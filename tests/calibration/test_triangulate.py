@@ -157,9 +157,9 @@ def test_derivatives_give_the_sigmas_of_drcal():
         (lambda c, e, p: (c[:2], e, p), ValueError, "same C >= 2 cameras; got 2 cameras, 3 extrinsics"),
         (lambda c, e, p: (c[:1], e[:1], p[:1]), ValueError, "same C >= 2 cameras; got 1 cameras"),
         (lambda c, e, p: (c, e, p[..., 0]), ValueError, "pixels must be"),
-        (lambda c, e, p: (e, e, p), TypeError, "cameras must be single Camera in a list"),
-        (lambda c, e, p: (c, c, p), TypeError, "extrinsics must be single Extrinsics"),
-        (lambda c, e, p: ([ct.Pinhole(torch.ones(2, 4))] * 3, e, p), TypeError, "must be single Camera"),
+        (lambda c, e, p: (e, e, p), TypeError, "cameras must be Camera"),
+        (lambda c, e, p: (c, c, p), TypeError, "extrinsics must be Extrinsics"),
+        (lambda c, e, p: ([ct.Pinhole(torch.ones(2, 4))] * 3, e, p), ValueError, "no batch dims"),
     ],
 )
 def test_bad_arguments(change, error, says):
