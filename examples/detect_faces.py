@@ -65,7 +65,7 @@ def detect(image: Tensor, find: Finder, camera: ct.Camera) -> Sample:
         return find(image)
     views, faces = ct.views.ring(camera, **VIEWS), list[Tensor]()
     for view, warp in zip(views(image), views, strict=True):
-        boxes, valid = warp.inverse().transform_boxes(find(view)["boxes"])  # type: ignore[operator]
+        boxes, valid = warp.inverse().transform_boxes(find(view)["boxes"])
         for box in boxes[valid]:
             crop = ct.views.look_at(camera, box, (256, 256), margin=0.5)
             for face in crop.inverse().transform_points(find(crop(image))["keypoints"])[0]:

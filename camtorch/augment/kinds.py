@@ -325,7 +325,7 @@ def warn_of_numbers(kind: str, name: str, value: Tensor, has_flags: bool, owner:
             f"{owner}: {name} has points at (-1, -1), which move as any pixels. If these are not seen, pass NaN, or "
             f"{name}_valid=..., a flag for each"
         )
-    if not known_true((pixels == pixels.clamp(0, 1)).all() & (pixels % 1 != 0).any()):
+    if value.numel() <= 3 or not known_true((pixels == pixels.clamp(0, 1)).all() & (pixels % 1 != 0).any()):
         return
     if value.shape[-1] != 3:
         corners = " x1, y1, x2, y2" if kind == "boxes" else ""

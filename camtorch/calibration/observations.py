@@ -20,7 +20,8 @@ _LEAST_CORNERS = 4
 _FLAT = 1e-5  # the width of a set of points over its length, below which it is a line
 _NORMALISED = 3.0  # px: coordinates that all are smaller are normalised ones
 _RIM = 0.02  # of the longer side: no detector finds corners further outside the image
-_MANY_OUTSIDE, _MOST_OF_A_VIEW = 0.05, 0.5  # of all corners, more than outliers; of those of a view
+_MANY_OUTSIDE, _MOST_OF_A_VIEW = 0.2, 0.5  # of all corners, more than outliers; of those of a view
+_FEW_OUTSIDE, _FEW_LEFT = 0.02, 0.2  # of all corners outside, and of these with the image's sides exchanged
 _SAME_ERRORS = 0.1  # the squared distance of two views over their squared residuals, which is 1 for independent noise
 _SAME_NOISE = 0.1  # px, the distance of two views that saving a file again may cause
 _NAMED = 6  # views at most, in a message
@@ -209,15 +210,21 @@ def _check_corners(points: Tensor, pixels: Tensor, seen: Tensor, owner: str) -> 
 def _check_inside(pixels: Tensor, seen: Tensor, size: tuple[int, int], owner: str) -> None:
     """Raise if pixels do not lie in an image of this size."""
     found = pixels[seen]
-    over = torch.maximum(pixels - pixels.new_tensor(size[::-1]) + 1.0, -pixels)
-    out = (over > _RIM * max(size)).any(-1)  # False for NaN
+
+    def outside(sides: tuple[int, int]) -> Tensor:
+        over = torch.maximum(pixels - pixels.new_tensor(sides[::-1]) + 1.0, -pixels)
+        return (over > _RIM * max(size)).any(-1)  # False for NaN
+
+    out = outside(size)
+    number, total = int(out.sum()), len(found)
+    exchanged = number > _FEW_OUTSIDE * total and int(outside(size[::-1]).sum()) <= _FEW_LEFT * number
     bad = out.sum(-1) > _MOST_OF_A_VIEW * seen.sum(-1)
     bad |= float(found.abs().max()) < _NORMALISED < min(size) / 2
-    if bool(bad.any()) or int(out.sum()) > _MANY_OUTSIDE * len(found):
+    if bool(bad.any()) or exchanged or number > _MANY_OUTSIDE * total:
         low, high = ("({:.6g}, {:.6g})".format(*end.tolist()) for end in (found.amin(0), found.amax(0)))
         raise ValueError(
-            f"{owner}: image_points must be pixels in the image of image_size {size}; got {int(out.sum())} of "
-            f"{len(found)} corners outside, and values from {low} to {high}, in "
+            f"{owner}: image_points must be pixels in the image of image_size {size}; got {number} of "
+            f"{total} corners outside, and values from {low} to {high}, in "
             f"{_views_of(bad if bool(bad.any()) else out.any(-1))}. image_size is (height, width) of all images, as "
             "image.shape[:2], points are (u, v), and unseen ones NaN"
         )
