@@ -243,12 +243,12 @@ class Change:
 
     def leads_to(self, camera: Camera | Sequence[Camera], rotation: Tensor | None = None) -> bool:
         """Whether these may be the cameras after, by number, intrinsics and rotation, where one may look."""
-        pairs = [(self.target.intrinsics.reshape(-1, 4), as_one(camera).intrinsics.reshape(-1, 4))]
-        pairs += [] if rotation is None else [(self.rotation, rotation.reshape(-1, 3, 3))]
+        pairs = [(self.target.intrinsics.reshape(-1, 4), as_one(camera).intrinsics.reshape(-1, 4), 1e-8)]
+        pairs += [] if rotation is None else [(self.rotation, rotation.reshape(-1, 3, 3), _HALF)]
         return all(
             ours.shape == its.shape
-            and not known_false(torch.isclose(ours.double(), its.to(ours.device).double(), _ROUNDED, _HALF))
-            for ours, its in pairs
+            and not known_false(torch.isclose(ours.double(), its.to(ours.device).double(), _ROUNDED, near))
+            for ours, its, near in pairs
         )
 
     def _cameras(self, cameras: list[Camera]) -> Camera:
