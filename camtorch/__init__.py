@@ -45,7 +45,7 @@ _NAMES = {
 _PLACES = {name: f"camtorch.{place}".rstrip(".") for place, names in _NAMES.items() for name in names.split()}
 """The module or package of camtorch in which each public name is found."""
 
-__version__ = "0.4.0.dev0"
+__version__ = "0.4.0"
 __all__ = sorted(_PLACES)
 
 # What is public needs torch, which takes a second to import; `camtorch --help` does not. So names come at first use.
