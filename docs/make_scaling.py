@@ -1,4 +1,4 @@
-"""The figure of cost over work on the page on performance: `python docs/make_scaling.py` writes it and its numbers.
+"""Cost over work on the page on performance: `python docs/make_scaling.py` writes the figure, its numbers and tables.
 
 Work grows: points, pixels, images of a batch, workers. A line's slope is that between its last point and the one two
 before, on logarithmic axes: 1 where twice the work takes twice the time. It needs
@@ -192,6 +192,21 @@ def drawn(runs: dict[str, dict]) -> None:
     figure.savefig(DOCS / "images" / "performance-scaling.png", dpi=80)
 
 
+def write_tables(runs: dict[str, dict]) -> None:
+    """Write the tables of a busy process and of memory into the page."""
+    rows = ["| 8 images 3x720x1280 uint8, 2 threads, ms | quiet | beside a busy process |", "|---|---:|---:|"]
+    for who in ("camtorch", "OpenCV"):
+        pairs = [run["beside a busy process"][who] for run in runs.values()]
+        cells = (" / ".join(f"{1e3 * pair[busy]:.3g}" for pair in pairs) for busy in ("0", "1"))
+        rows.append(f"| {who}, kept map: {' / '.join(runs)} | {' | '.join(cells)} |")
+    rows += ["", "| a process has at most, MB | |", "|---|---:|"]
+    rows += [f"| {step} | {size:.0f} |" for step, size in next(iter(runs.values()))["memory"]["MB"].items()]
+    page = DOCS / "performance.md"
+    start, end = "<!-- make_scaling.py -->\n", "<!-- /make_scaling.py -->"
+    before, _, rest = page.read_text().partition(start)
+    page.write_text("\n".join((before + start + rows[0], *rows[1:], end + rest.partition(end)[2])))
+
+
 if __name__ == "__main__":
     if len(sys.argv) > 1 and sys.argv[1] == "--one":
         Path(sys.argv[2]).write_text(json.dumps(measured()))
@@ -204,3 +219,4 @@ if __name__ == "__main__":
         runs["AVX2" if cpu == "avx2" else "AVX-512"] = json.loads(path.read_text())
     path.write_text(json.dumps(runs, indent=1) + "\n")
     drawn(runs)
+    write_tables(runs)
