@@ -86,7 +86,7 @@ def axes() -> Drawing:
     draw.text((left + width, top - 12), "W - 0.5", GREY, 22, anchor="middle")
     draw.text((left - 8, top + height + 8), "H - 0.5", GREY, 22, anchor="end")
     draw.text((place(3, 2)[0] - 6, top + height + 30), "box (1, 0, 3, 2)", "#b86e00", 24, anchor="end")
-    draw.text((540, 450), "centres whole, edges half numbers", GREY, 24)
+    draw.text((540, 450), "centres whole, edges half", GREY, 24)
     return draw
 
 
@@ -108,7 +108,7 @@ def motions() -> Drawing:
     draw.text((236, 276), "t", INK, 26, bold=True)
     draw.text((30, 412), "p_camera = R p_world + t", GREY, 24)
 
-    draw.text((520, 42), "A warp: two cameras in one place", INK, 26, bold=True)
+    draw.text((520, 42), "A warp turns rays", INK, 26, bold=True)
     middle = (690.0, 330.0)
 
     def towards(angle: float, length: float) -> tuple[float, float]:
@@ -126,8 +126,8 @@ def motions() -> Drawing:
     draw.line((middle, towards(40, 270)), VIOLET, 2, dash="7 7")
     draw.dot(towards(40, 270), INK, 6)
     draw.dot(middle, INK, 5)
-    draw.text((middle[0] + 150, middle[1] - 60), "one ray,", VIOLET, 24)
-    draw.text((middle[0] + 150, middle[1] - 32), "two pixels", VIOLET, 24)
+    draw.text((middle[0] + 138, middle[1] - 60), "one ray,", VIOLET, 24)
+    draw.text((middle[0] + 138, middle[1] - 32), "two pixels", VIOLET, 24)
     draw.text((520, 412), "ray_target = R ray_source", GREY, 24)
     return draw
 
