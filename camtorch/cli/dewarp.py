@@ -40,13 +40,13 @@ class Dewarping:
         if videos.is_video(source):
             codec, crf = self.arguments.codec, self.arguments.crf
             return videos.remake(source, target, lambda size: self._warp(source, size), codec, crf, done)
-        image, orientation = _photographs.read_stored(source)
+        image, orientation, profile = _photographs.read_stored(source)
         rows, columns = image.shape[-2:]
         warp, facts = self._warp(source, (rows, columns))
         with torch.no_grad():
             result = warp(image[None])[0].permute(1, 2, 0).contiguous()
         del image  # frees hundreds of megabytes
-        images.write(target, result.numpy(), orientation=orientation, synced=False)
+        images.write(target, result.numpy(), orientation=orientation, profile=profile, synced=False)
         return facts
 
     def warp_of(self, camera: Camera) -> Dewarp:

@@ -14,7 +14,7 @@ from camtorch.io.photographs import ORIENTATION, ImageFileError
 from camtorch.io.writing import replacing
 from camtorch.values.arguments import warn
 
-_KEEP_ORIENTATION = ("JPEG", "PNG", "TIFF", "WEBP")
+_KEEP_BOTH = ("JPEG", "PNG", "TIFF", "WEBP")
 
 
 def check_kind(path: Path, *, is_video: bool = False) -> None:
@@ -25,11 +25,18 @@ def check_kind(path: Path, *, is_video: bool = False) -> None:
         raise ImageFileError(f"{path}: the suffix of the {kind} must be one of {', '.join(known)}; got {what}")
 
 
-def write(path: Path, pixels: NDArray[Any], *, orientation: int | None = None, synced: bool = True) -> None:
+def write(
+    path: Path,
+    pixels: NDArray[Any],
+    *,
+    orientation: int | None = None,
+    profile: bytes | None = None,
+    synced: bool = True,
+) -> None:
     """Write (H, W, C) uint8 or (H, W, 1) uint16 by `replacing`, and make missing folders."""
     image = Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
     kind = Image.registered_extensions()[path.suffix.lower()]
-    options: dict[str, Any] = {"quality": 95}
+    options: dict[str, Any] = {"quality": 95, "icc_profile": profile}
     if orientation is not None:
         options["exif"] = Image.Exif()
         options["exif"][ORIENTATION] = orientation
@@ -42,6 +49,7 @@ def write(path: Path, pixels: NDArray[Any], *, orientation: int | None = None, s
         if isinstance(error, OSError) and "cannot write mode" in str(error):
             reason = f"{path.suffix} files hold no image of mode {image.mode}; .png does"
         raise ImageFileError(f"{path}: {reason}") from None
-    if orientation not in (None, 1) and kind not in _KEEP_ORIENTATION:
-        turned = "the Exif orientation, which turns the image, is lost"
-        warn(f"{turned}: {path.suffix} files hold none")
+    turned = "Exif orientation, which turns the image," if orientation not in (None, 1) else ""
+    for lost in filter(None, (turned, profile and "ICC profile of its colours")):
+        if kind not in _KEEP_BOTH:
+            warn(f"the {lost} is lost: {path.suffix} files hold none")

@@ -6,6 +6,7 @@ import argparse
 import gc
 import importlib
 import importlib.metadata
+import io
 import os
 import sys
 import warnings
@@ -51,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     The status is 0; 1 if some of many files failed; 2 after an error, which is one line on stderr; 130 after an
     interrupt; 141 if the reader of the output closed it.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")  # for names of files that its encoding lacks
     try:
         arguments = make_parser().parse_args(argv)
         module = f"camtorch.cli.{arguments.command}"

@@ -50,19 +50,21 @@ def size_of(path: Path) -> tuple[int, int] | None:
     return None
 
 
-def read_stored(path: Path) -> tuple[Tensor, int | None]:
-    """Read an image as it is stored, and its Exif orientation, which is not applied.
+def read_stored(path: Path) -> tuple[Tensor, int | None, bytes | None]:
+    """Read an image as it is stored, its Exif orientation, which is not applied, and the ICC profile of its colours.
 
     Pixels are (C, H, W) uint8 with C = 1 grey, 2 grey and alpha, 3 RGB or 4 RGBA, also for palette, CMYK and others;
-    or (1, H, W) uint16 for deep grey images. It warns if it leaves out data: the lower bits of deep colours, which
-    Pillow does not read, and all images but the first. Other files raise ImageFileError.
+    or (1, H, W) uint16 for deep grey images. A profile of other colours than theirs, as of CMYK, is None. It warns if
+    it leaves out data: the lower bits of deep colours, which Pillow does not read, and all images but the first. Other
+    files raise ImageFileError.
     """
     with _opened(path) as opened:
         count, tiles = getattr(opened, "n_frames", 1), getattr(opened, "tile", ())
         # Pillow's decoder reduces deep colours to eight bits; its arguments show that
         cut = opened.mode not in _DEEP and any(re.search(r";16|65535", str(tile[3])) for tile in tiles)
         orientation = opened.getexif().get(ORIENTATION)
-        image = load_stored(opened)
+        image, profile = load_stored(opened), opened.info.get("icc_profile") or b""
+        space = profile[16:20]  # of its header
         if count > 1:
             warn(f"{path}: only the first of {count} images is read")
         if cut:
@@ -71,11 +73,12 @@ def read_stored(path: Path) -> tuple[Tensor, int | None]:
             deep = np.asarray(image)
             if image.mode == "F" or deep.min() < 0 or deep.max() > 65535:
                 raise ImageFileError(f"{path}: pixels must have 8 or 16 bits; got {deep.dtype}, up to {deep.max()}")
-            return torch.from_numpy(deep.astype(np.uint16))[None], orientation
+            return torch.from_numpy(deep.astype(np.uint16))[None], orientation, profile if space == b"GRAY" else None
         clear = "transparency" in image.info or image.mode in ("LA", "PA", "RGBA", "RGBa", "La")
         kind = ("L" if image.mode in ("1", "L", "LA", "La") else "RGB") + ("A" if clear else "")
         pixels = torch.from_numpy(np.array(image if image.mode == kind else image.convert(kind)))
-    return (pixels[None] if pixels.ndim == 2 else pixels.permute(2, 0, 1)), orientation
+    pixels = pixels[None] if pixels.ndim == 2 else pixels.permute(2, 0, 1)
+    return pixels, orientation, profile if space == (b"GRAY" if kind[0] == "L" else b"RGB ") else None
 
 
 def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int, quality: int) -> bytes:

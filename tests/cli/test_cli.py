@@ -1,6 +1,7 @@
 """`camtorch dewarp` on one image, and what all commands have in common."""
 
 import importlib.metadata
+import io
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import FILES, LEVEL, MATRIX, camera, command, opened, pixels, refused
-from PIL import Image
+from PIL import Image, ImageCms
 
 import camtorch as ct
 from camtorch.boards.finding import IMAGES
@@ -57,7 +58,7 @@ def test_another_resolution_needs_rescale(folder, capsys):
     assert opened("(48, 32).png").size == (48, 32)
 
 
-def test_where_the_result_goes(folder, capsys):
+def test_where_the_result_goes(folder, capsys, monkeypatch):
     words = ["dewarp", "in.png", "--camera", "camera.yml", "-o"]
     command(*words, "new/folder/out.png")
     assert opened("new/folder/out.png").size == (96, 64)
@@ -78,6 +79,9 @@ def test_where_the_result_goes(folder, capsys):
     for name in (folder / "in.png", "link.png", "hard.png", "camera.png"):
         assert "which is read. Name another file" in refused(capsys, *words, name, "--force")
     assert Path("in.png").read_bytes() == image
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), "ascii"))  # which lacks a letter
+    command(*words, "späce.png")
+    assert sys.stdout.buffer.getvalue().startswith(rb"sp\xe4ce.png: kannala_brandt")
 
 
 def test_what_pillow_does_not_read_is_said(folder, capsys):
@@ -108,11 +112,12 @@ def test_kinds_of_image(folder, mode):
     ramp = np.broadcast_to(np.linspace(0, 255, 96).astype(np.uint8), (64, 96))
     deep = Image.fromarray(ramp.astype(np.uint16) * 257)
     image = deep if mode == "I;16" else Image.fromarray(np.stack((ramp,) * 3, -1)).convert(mode)
-    image.save("kind.tif")
+    image.save("kind.tif", icc_profile=PROFILE)
     Path("level.yml").write_text(LEVEL)
     command("dewarp", "kind.tif", "--camera", "level.yml", "-o", "out.tif")
     out = opened("out.tif")
     assert out.mode == {"1": "L", "P": "RGB", "CMYK": "RGB"}.get(mode, mode)
+    assert ("icc_profile" in out.info) == out.mode.startswith("RGB")  # as it is of such colours
     if mode not in ("1", "P"):
         # the camera of an image without distortion: nothing may change
         expected = image if mode == "I;16" else image.convert(out.mode)
@@ -131,10 +136,13 @@ def test_transparency_by_a_colour_stays(folder, mode, clear):
     assert [out.getpixel((x, 32))[-1] for x in (10, 80)] == [0, 255]
 
 
+PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+
+
 def tagged(path, orientation, **options):
     exif = Image.Exif()
     exif[0x0112] = orientation
-    opened("in.png").save(path, exif=exif, **options)
+    opened("in.png").save(path, exif=exif, icc_profile=PROFILE, **options)
 
 
 def orientation_of(path):
@@ -156,12 +164,15 @@ def test_images_are_taken_as_they_are_stored(folder, suffix, options):
     assert size_of(Path(f"turned{suffix}")) == (64, 96)
 
 
-def test_the_exif_orientation_stays_or_its_loss_is_said(folder, capsys):
+def test_the_exif_orientation_and_the_profile_stay_or_their_loss_is_said(folder, capsys):
     tagged("turned.jpg", 3)
     for suffix in sorted(IMAGES):
         command("dewarp", "turned.jpg", "--camera", "camera.yml", "-o", f"out{suffix}", "--size", "9x6")
+        notes = capsys.readouterr().err
         lost = f"the Exif orientation, which turns the image, is lost: {suffix} files hold none\n"
-        assert (orientation_of(f"out{suffix}") == 3) != (lost in capsys.readouterr().err), suffix
+        assert (orientation_of(f"out{suffix}") == 3) != (lost in notes), suffix
+        kept = opened(f"out{suffix}").info.get("icc_profile") == PROFILE
+        assert kept != (f"the ICC profile of its colours is lost: {suffix} files hold none\n" in notes), suffix
 
 
 @pytest.mark.parametrize("degrees", [70, 200])
