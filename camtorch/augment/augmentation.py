@@ -376,7 +376,7 @@ class Augmentation(SampleTransform):
             )
 
     @on_samples
-    @hinting(FRONT_ENDS)
+    @hinting(f"Name the fields, as in image=image. {FRONT_ENDS}")
     def forward(
         self,
         sample: Mapping[str, Any] | None = None,

@@ -23,6 +23,7 @@ from camtorch.augment.presets import PRESETS
 from camtorch.augment.ranges import Range, as_range
 from camtorch.augment.sample import Batch, Sample
 from camtorch.cameras.camera import Camera
+from camtorch.cameras.catalogue import ELSEWHERE
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free, are_numbers, known_false, with_derivatives_of
 from camtorch.lenses.drawing import covering, drawn
@@ -471,14 +472,12 @@ def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
         if like is not None and like.batch_shape:
             raise ValueError(f"{owner}: like must be a single camera; got batch dims {tuple(like.batch_shape)}")
         return like
-    if isinstance(like, str) and like in PRESETS:
-        return PRESETS[like].camera()
-    if isinstance(like, str) and like in MODELS:
-        return MODELS[like]([1.0, 1.0, 0.0, 0.0]).detach()
-    close = get_close_matches(like, [_REAL, *PRESETS, *MODELS], 1) if isinstance(like, str) else []
+    if isinstance(like, str) and like in (*PRESETS, *MODELS):
+        return PRESETS[like].camera() if like in PRESETS else MODELS[like]([1.0, 1.0, 0.0, 0.0]).detach()
+    close = get_close_matches(like, [_REAL, *PRESETS, *MODELS, *ELSEWHERE], 1) if isinstance(like, str) else []
     raise ValueError(
         f"{owner}: like must be a Camera, 'real', a preset ({', '.join(PRESETS)}) or a model ({', '.join(MODELS)}); "
-        f"got {like!r}" + (f". Did you mean {close[0]!r}?" if close else "")
+        f"got {like!r}" + (f". Did you mean {ELSEWHERE.get(close[0], close[0])!r}?" if close else "")
     )
 
 

@@ -114,7 +114,7 @@ class FaceNormalizer(SampleTransform):
             at = ", ".join(f"{d:.4g}" for d in distance.flatten().tolist())
             raise ValueError(
                 f"{self._name}: distance must be in the unit of the poses; got {self.distance:g} for faces at {at}. "
-                "Pass distance=0.6 for poses in metres"
+                "Pass distance=0.6 for poses in metres, distance=600 for millimetres"
             )
         down = down / size
         rotation = torch.stack((torch.linalg.cross(down, forward), down, forward), -2)
@@ -146,8 +146,7 @@ class FaceNormalizer(SampleTransform):
         else:
             raise ValueError(f"{self._name}: a sample must have head_pose, or rvec and tvec; got {', '.join(sample)}")
         centre = kinds.get("face_center", centre)
-        change = self.change(camera, head, centre)
-        moved = self._moved(sample, batch, change)
+        moved = self._moved(sample, batch, self.change(camera, head, centre))
         scale = self.distance / centre.norm(dim=-1)
         moved["scale"] = scale if batch.form.batched else scale.squeeze(0)
         moved["source_camera"] = camera.clone()

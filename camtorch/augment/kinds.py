@@ -173,9 +173,11 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single
         meant = f"Did you mean {close[0]!r}? " if close else ""
         if _is_angle(name):
             meant = "A head's angles go in as head_pose, by ct.head_rotation(), a gaze's as pitch_yaw. "
+        if name in ("K", "intrinsics", "camera_matrix"):
+            meant = "A camera goes in as camera=, as ct.BrownConrady.from_matrix(K, D, image_size=(height, width)). "
         raise ValueError(
             f"{owner}: {name!r} must have a kind, by which its numbers move with the camera; got real numbers. {meant}"
-            f"Pass fields={{{name!r}: KIND}}, with KIND one of {', '.join(KINDS)} or {KEEP}"
+            f"Pass fields={{{name!r}: KIND}}, with KIND one of {', '.join(KINDS)} or {KEEP}, to leave it unchanged"
         )
     return base
 
@@ -261,8 +263,7 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
     """Raise a ValueError if a kind does not take this shape."""
     field = KINDS[kind]
     dims = value.ndim - batched
-    least, most = field.dims, field.most_dims
-    if not least <= dims <= most or (field.last and value.shape[-1] not in field.last):
+    if not field.dims <= dims <= field.most_dims or (field.last and value.shape[-1] not in field.last):
         what = field.shape if batched else field.shape.replace("(B, ", "(")
         hint = _hint(name)
         if kind in ("gaze", "directions") and value.ndim and value.shape[-1] == 2:
@@ -272,12 +273,14 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
         if kind in ("head_pose", "pose") and value.shape[-1:] == (3,):
             hint = (
                 ". Rotations R (..., 3, 3) go in as torch.nn.functional.pad(R, (0, 1)), with zeros for the place; "
-                "R = ct.head_rotation(angles), of pitch, yaw and roll in radians"
+                "R = ct.head_rotation(angles), of pitch, yaw and roll in radians. OpenCV's go in as rvec=..., tvec=..."
             )
         if kind in ("boxes", "keypoints", "landmarks") and dims == 1 and value.shape[-1] in field.last:
             hint = f". A single one for each sample goes in as {name}[..., None, :]"
-        if kind == "image" and value.ndim == 5:
-            hint = f". The frames of clips go in as a batch, by {name}.flatten(0, 1)"
+            hint += f", those that all samples share as {name}.expand(B, -1, -1)" if batched else ""
+        if kind == "image" and value.ndim in (2, 5):
+            clips = f"The frames of clips go in as a batch, by {name}.flatten(0, 1)"
+            hint = f". {clips}" if value.ndim == 5 else f". A grey image goes in as {name}[None]"
         if kind == "keypoints" and value.ndim and value.shape[-1] == 3:
             hint = f". Pass visibility, [..., 2], as {name}_valid=..., a flag for each"
         raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{hint}")

@@ -262,9 +262,8 @@ class SampleTransform(KeepsCamera, nn.Module):
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
         """Return the sample and the keyword arguments as one dict."""
         if not (sample is None or hasattr(sample, "keys")):
-            got = type(sample).__name__
-            must = "a sample must be a dict of fields, or keywords, as in image=..."
-            raise TypeError(f"{self._name}: {must}; got {got}. {FRONT_ENDS}")
+            must = f"a sample must be a dict of fields, or keywords, as in image=...; got {type(sample).__name__}"
+            raise TypeError(f"{self._name}: {must}. {FRONT_ENDS}")
         return sample if isinstance(sample, Single) and not fields else {**({} if sample is None else sample), **fields}
 
     def _clips(self, sample: Sample, kinds: Mapping[str, str] | None = None) -> Clips | None:

@@ -226,7 +226,7 @@ def _check_inside(pixels: Tensor, seen: Tensor, size: tuple[int, int], owner: st
             f"{owner}: image_points must be pixels in the image of image_size {size}; got {number} of "
             f"{total} corners outside, and values from {low} to {high}, in "
             f"{_views_of(bad if bool(bad.any()) else out.any(-1))}. image_size is (height, width) of all images, as "
-            "image.shape[:2], points are (u, v), and unseen ones NaN"
+            "image.shape[:2], points are (u, v), not parts of its sides, and unseen ones NaN"
         )
 
 

@@ -208,8 +208,7 @@ class _Given(NamedTuple):
         try:
             batch = broadcast_shapes(camera.batch_shape, *leads)
         except ValueError:
-            own = tuple(camera.batch_shape)
-            got = f"{shapes}, weights of {leads[2]} and a camera of {own}"
+            got = f"{shapes}, weights of {leads[2]} and a camera of {tuple(camera.batch_shape)}"
             raise ValueError(f"{owner}: batch dims must broadcast; got {got}") from None
         dtype = working_dtype(points, seen_at, *camera._tensors)
 

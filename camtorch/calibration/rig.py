@@ -19,7 +19,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_vector
-from camtorch.values.arguments import warn
+from camtorch.values.arguments import hinting, warn
 from camtorch.values.threads import on_one_thread
 
 
@@ -94,6 +94,7 @@ class RigCalibration:
 
 
 @on_one_thread
+@hinting("Models, image_points and image_sizes are dicts by the same names: image_sizes={'left': (480, 640), ...}")
 def calibrate_rig(
     models: Mapping[str, type[Camera] | str | Camera],
     object_points: Points,

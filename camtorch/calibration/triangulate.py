@@ -105,7 +105,8 @@ def _as_list(modules: Sequence[M] | M, name: str, kind: type[M], count: int) -> 
         return [modules[i] for i in range(len(modules))] if modules.batch_shape else [modules] * count
     for module in cast(Sequence[M], modules):
         if not isinstance(module, kind):
-            raise TypeError(f"triangulate: {name} must be {kind.__name__} in a list; got {shown(module)}")
+            how = ". ct.Extrinsics.from_matrix(T) makes one of a matrix" * (name == "extrinsics")
+            raise TypeError(f"triangulate: {name} must be {kind.__name__} in a list; got {shown(module)}{how}")
         if module.batch_shape:
             own = tuple(module.batch_shape)
             raise ValueError(f"triangulate: {name} must have no batch dims of their own; got one with {own}")

@@ -18,16 +18,14 @@ from camtorch.values.arguments import LEFT, shown
 
 KindT = TypeVar("KindT", bound=type[CameraLike])
 
-_ELSEWHERE = {
-    "opencv": "brown_conrady",
-    "plumb_bob": "brown_conrady",
-    "radtan": "brown_conrady",
-    "fisheye": "kannala_brandt",
-    "opencv_fisheye": "kannala_brandt",
-    "equidistant": "kannala_brandt",
-    "omnidir": "mei",
+_NAMES = {
+    "brown_conrady": "opencv plumb_bob radtan pinhole-radtan brown",
+    "kannala_brandt": "fisheye opencv_fisheye equidistant pinhole-equi kb4",
+    "double_sphere": "ds",
+    "mei": "omnidir omni-radtan",
 }
-"""Names of some models in OpenCV, ROS, Kalibr and COLMAP."""
+ELSEWHERE = {name: key for key, names in _NAMES.items() for name in names.split()}
+"""Names of some models in OpenCV, ROS, Kalibr, Basalt and COLMAP."""
 
 
 class Catalogue(MutableMapping[str, KindT]):
@@ -86,11 +84,10 @@ class Catalogue(MutableMapping[str, KindT]):
             if texts and key in self:
                 return functools.reduce(lambda kind, text: cast("KindT", kind.variant(text)), texts, self[key])
             if model not in self:
-                keys = {name.lower(): key for key, cls in self.items() for name in (key, cls.__name__)} | _ELSEWHERE
+                keys = {name.lower(): key for key, cls in self.items() for name in (key, cls.__name__)} | ELSEWHERE
                 close = difflib.get_close_matches(model.lower(), keys, 1)
-                meant = f" (did you mean {keys[close[0]]!r}?)" if close else ""
-                keys_text = ", ".join(sorted(self))
-                raise ValueError(f"{owner}: model must be one of {keys_text}; got {model!r}{meant}. {LEFT}")
+                how = f" (did you mean {keys[close[0]]!r}?)" if close else ""
+                raise ValueError(f"{owner}: model must be one of {', '.join(sorted(self))}; got {model!r}{how}. {LEFT}")
             return self[model]
         if isinstance(model, type) and model.__module__ == parametrize.__name__:  # the class of one parametrized camera
             model = model.__bases__[0]

@@ -165,7 +165,7 @@ class Rig(UnsharedState):
             ValueError: If there are several, or none.
         """
         if len(self.cameras) != 1:
-            raise ValueError(f"Rig: cameras must be one for rig.camera; got {list(self.cameras)}")
+            raise ValueError(f"Rig: cameras must be one for rig.camera; got {list(self.cameras)}. Take rig[name]")
         return next(iter(self.cameras.values()))
 
     def camera_of(self, name: str) -> Camera:

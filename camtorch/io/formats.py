@@ -180,7 +180,7 @@ def _read(path: str, content: str | bytes | Mapping[str, Any] | list[Any], forma
         if format == by_keys.NAMES.format or (format is None and by_keys.matches(keys)):
             return by_keys.parse(Record(path, keys)), by_keys.NAMES.format
     first = ", ".join(f"{key!r:.30}" for key in list(keys)[:5]) or "none"
-    raise CameraFileError(path, "content", f"keys must be those of a known format; got {first}")
+    raise CameraFileError(path, "content", f"keys must be those of a known format; got {first}. OpenCV's are K and D")
 
 
 def save(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None = None) -> None:

@@ -163,8 +163,7 @@ class Extrinsics(BatchedModule):
         mine, its = rotation_matrix(self.rotation), rotation_matrix(other.rotation)
         product = rotate_planes(mine, its.unbind(-2)).movedim(0, -2)
         moved = rotate_planes(mine, other.translation.unsqueeze(-1).unbind(-2)).squeeze(-1).movedim(0, -1)
-        composed = Extrinsics(rotation_vector(product).unsqueeze(-1), moved + self.translation)
-        return composed.freeze_like(self, other)
+        return Extrinsics(rotation_vector(product).unsqueeze(-1), moved + self.translation).freeze_like(self, other)
 
     @property
     def position(self) -> Tensor:

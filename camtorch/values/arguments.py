@@ -43,13 +43,12 @@ def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Re
             try:
                 return function(*args, **kwargs)
             except TypeError as error:
-                is_inner = error.__traceback__ is None or error.__traceback__.tb_next is not None
                 if name := next((name for name in kwargs if f"unexpected keyword argument {name!r}" in str(error)), ""):
                     close = difflib.get_close_matches(name, inspect.signature(function).parameters, 1, CLOSE)
                     meant = f"Did you mean {close[0]!r}? " if close else ""
                     unknown = f"{function.__qualname__}() got an unexpected keyword argument {name!r}"
                     raise TypeError(f"{unknown}. {meant}{hint}. {LEFT}") from None
-                if is_inner:
+                if error.__traceback__ is None or error.__traceback__.tb_next is not None:  # of the function's body
                     raise
                 raise TypeError(f"{error}. {hint}") from None
 
@@ -205,6 +204,8 @@ def no_camera(value: object) -> str:
         return f"{type(value).__name__}; ct.from_kornia(theirs) makes a camera and a pose of it"
     if isinstance(value, os.PathLike) or (isinstance(value, str) and os.path.splitext(value)[1]):
         return f"{type(value).__name__}; ct.load({os.fspath(value)!r:.60}).camera loads the camera of a file"
+    if isinstance(value, (list, tuple)) and value and isinstance(value[0], nn.Module):
+        return f"{type(value).__name__}; ct.Mixed(cameras) makes a batch of a list of cameras"
     if tuple(getattr(value, "shape", ()))[-2:] == (3, 3):
         return f"{type(value).__name__} (3, 3); ct.BrownConrady.from_matrix(K, distortion) makes a camera of a matrix K"
     return type(value).__name__
@@ -410,8 +411,9 @@ def as_points(
     values = as_values(values, name, owner, parameters[0].device)
     takes = f"{name} must be (*B, *N, {size}) with batch dims *B = {tuple(batch)}"
     if values.ndim == 0 or values.shape[-1] != size:
-        turned = values.ndim > 1 and values.shape[-2] == size
-        hint = f". Pass points in columns as {name}.T" if turned else ""
+        hint = f". Pass {name}[..., :3], x, y, z alone" if size == 3 < max(values.shape[-1:], default=0) else ""
+        if values.ndim > 1 and values.shape[-2] == size:
+            hint = f". Pass points in columns as {name}.T"
         raise ValueError(f"{owner}: {takes}; got shape {tuple(values.shape)}{hint}")
     lead, rest = values.shape[: len(batch)], values.shape[len(batch) : -1]
     try:

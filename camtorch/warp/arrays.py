@@ -64,8 +64,7 @@ def as_planes(array: object, name: str, owner: str, size: tuple[int, int] | None
     """
     tensor = as_tensor(array, name, owner)
     shape = tuple(tensor.shape)
-    is_known = tensor.ndim in ((2, 3, 4) if many else (2, 3))
-    if not is_known or (len(shape) > 2 and size == shape[-2:]):
+    if tensor.ndim not in ((2, 3, 4) if many else (2, 3)) or (len(shape) > 2 and size == shape[-2:]):
         forms = "(H, W, C), (H, W) or (N, H, W, C)" if many else "(H, W, C) or (H, W)"
         hint = f". np.moveaxis({name}, -3, -1) puts channels last" if size == shape[-2:] else ""
         hint += f", {name}[..., None] adds one to grey images" if hint and many else ""
@@ -92,7 +91,8 @@ def as_planes_of(
     mode = None if isinstance(image, np.ndarray) else getattr(image, "mode", None)
     if mode is None and not isinstance(image, np.ndarray):
         forms = "a tensor (..., C, H, W), an array (H, W, C) or a PIL image"
-        raise TypeError(f"{owner}: {name} must be {forms}; got {type(image).__name__}")
+        how = "Image.open(path) reads a file, np.stack(images) joins several; cv2.imread returns None if it fails"
+        raise TypeError(f"{owner}: {name} must be {forms}; got {type(image).__name__}. {how}")
     if mode in ("1", "P", "PA"):
         raise ValueError(
             f"{owner}: {name} must be an image whose values can be averaged; got a PIL image of mode {mode!r}. "

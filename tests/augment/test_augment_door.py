@@ -36,7 +36,7 @@ OPTIONS = [
 ]
 OF_LENSES = [
     (RandomCamera, {"crops": 0.9}, r"unknown keyword 'crops'; did you mean 'crop'\?"),
-    (RandomLens, {"distorsion": 0.1}, r"unknown keyword 'distorsion'; did you mean 'distortion'\?"),
+    (RandomLens, {"like": "fisheye"}, r"like must be .*got 'fisheye'\. Did you mean 'kannala_brandt'\?"),
     (RandomLens, {"xyz": 1}, "unknown keyword 'xyz'; known are like, fov, focal, .*min_filled"),
     (RandomLens, {"yaw": 5}, "unknown keyword .yaw.; .*RandomCamera has it"),
     (RandomCamera, {"like": "dms13"}, rf".*\({', '.join(PRESETS)}\) or a model .*; got 'dms13'. .*'dms130'\?"),

@@ -136,7 +136,7 @@ def test_what_cannot_be_normalised_says_why(pinhole):
         (lambda: normalizer(gaze=torch.rand(2, 3)), r"must have head_pose, or rvec and tvec; got gaze"),
         (lambda: normalizer(sample), "off the camera"),
         (lambda: normalizer(head_pose=torch.rand(2, 3)), r"head_pose must be .*; got shape \(2, 3\)"),
-        (lambda: normalizer(batch()), "in the unit of the poses; .* distance=0"),
+        (lambda: normalizer(batch()), "in the unit of the poses; .* distance=0.* distance=600"),
         (lambda: FaceNormalizer(distance=-1), "distance must be positive; got -1"),
         (lambda: normalizer.inverse(gaze=torch.rand(2, 3)), "must have camera, rotation, source_camera"),
     ):

@@ -267,7 +267,7 @@ def test_the_new_camera_learns_as_the_old_one_did():
         (("pinhole",), {"max_angle": 0.0}, ValueError, "max_angle must be positive"),
         (("pinhole",), {"max_angle": 60.0}, ValueError, "radians, up to pi; got 60"),
         (("Pinhole",), {}, ValueError, "did you mean 'pinhole'"),
-        (("fisheye",), {}, ValueError, "did you mean 'kannala_brandt'"),  # as OpenCV calls it
+        (("pinhole-equi",), {}, ValueError, "did you mean 'kannala_brandt'"),  # as Kalibr calls it
         (("pinhole",), {"max_angle": math.nan}, ValueError, "max_angle must be positive"),
         (("pinhole",), {"tolerance": 0.0}, ValueError, "tolerance must be positive"),
         (("pinhole",), {"image_size": (0, 3)}, ValueError, "image_size must be positive"),

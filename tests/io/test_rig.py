@@ -108,7 +108,7 @@ def test_which_camera_is_meant():
     rig = rig_of(["left", "right"])
     assert "left: KannalaBrandt 640x480 (300, 300," in repr(rig)
     for call, told in (
-        (lambda: rig.camera, "must be one for rig.camera"),
+        (lambda: rig.camera, r"must be one for rig.camera.* Take rig\[name\]"),
         (lambda: rig.camera_of("x"), "that of a camera or an image.* got 'x'"),
         (lambda: ct.Rig({"a": camera()}, images={"i": "b"}), r"camera of 'i' must be one of \['a'\]; got 'b'"),
         (lambda: rig.between("left", "middle"), "that of a camera or an image.* got 'middle'"),

@@ -115,7 +115,7 @@ WRONG = [
     (lambda: ct.Warp(CAMERA, BATCH)(IMAGES[:1].expand(3, -1, -1, -1)), ValueError, r"images must be 1 or 2, .* got 3"),
     (lambda: WARP(IMAGES.mT), ValueError, r"\(24, 32\).*\(32, 24\)"),
     (lambda: WARP(MASKED), TypeError, r"Warp: images must be an array without a mask; got a MaskedArray: its mask"),
-    (lambda: WARP(["image"]), TypeError, r"must be a tensor .*, an array .* or a PIL image; got list"),
+    (lambda: WARP(["image"]), TypeError, r"must be a tensor .*, an array .* or a PIL image; got list.*np\.stack"),
     (lambda: WARP(IMAGES[0].numpy()), ValueError, r"got shape \(3, 24, 32\)\. .*np.moveaxis\(images, -3, -1\)"),
     (lambda: WARP(IMAGES[:, 0].numpy()), ValueError, r"\(2, 24, 32\)\. .* images\[..., None\] adds one"),
     (lambda: ct.Warp(CAMERA, BATCH)(IMAGES[:, 0]), ValueError, r"2 cameras.*\(2, 24, 32\).*masks\[:, None\]"),
