@@ -14,7 +14,7 @@ from camtorch.augment.change import Change, Part, alone, as_one, by_kinds, check
 from camtorch.augment.elsewhere import Elsewhere, remember_camera, twin_of
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.kinds import FRONT_ENDS, Named
-from camtorch.augment.ranges import Range, Spans, draw, draw_shares
+from camtorch.augment.ranges import Range, Spans, draw
 from camtorch.augment.sample import Batch, Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
@@ -196,12 +196,6 @@ class Augmentation(SampleTransform):
         values, self.__dict__["_spans"] = draw(self.ranges, count, p, same_on_batch, generator, self._spans)
         return values
 
-    def _numbers_of_one(self, generator: torch.Generator | None) -> tuple[bool, list[float], Spans]:
-        """Draw for one sample: whether it is augmented, and the values of all ranges, in a row."""
-        gate, shares, spans = draw_shares(self.ranges, 1, self.p, generator, self._spans)
-        self.__dict__["_spans"] = spans
-        return self.p >= 1 if gate is None else bool(gate), spans.numbers(shares.tolist()), spans
-
     def with_boxes(self, draw: Mapping[str, Any], boxes: Tensor | Sequence[Tensor] | None) -> Mapping[str, Any]:
         """Return a draw with the boxes it needs of those of samples, (B, M, 4), or (M, 4) each, or None."""
         missing = {name: index for name, index in self.crops.items() if name not in draw}
@@ -298,12 +292,7 @@ class Augmentation(SampleTransform):
         return self._between(rows, source, values, target, rotation)
 
     def _between(
-        self,
-        rows: list[int] | None,
-        source: Camera,
-        values: Mapping[str, Any],
-        target: Camera,
-        rotation: Tensor | None,
+        self, rows: list[int] | None, source: Camera, values: Mapping[str, Any], target: Camera, rotation: Tensor | None
     ) -> Part:
         """Return the part whose samples go from a source to a target, with what of the values is beside the cameras."""
         beside = self.beside_the_camera.intersection(values)
@@ -313,14 +302,11 @@ class Augmentation(SampleTransform):
 
     def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
         """Return what was drawn, (*B,) or (*B, size), where all is alike once: one map then serves all samples."""
-        if isinstance(draw["apply"], list):  # of one sample
-            return {name: value[0] for name, value in draw.items() if name != "apply"}
         values = {name: value for name, value in draw.items() if name != "apply"}
-        if not source.batch_shape and (len(draw["apply"]) == 1 or all(map(_are_alike, values.values()))):
-            values = {
-                n: value[0].tolist() if isinstance(value, np.ndarray) else value[0] for n, value in values.items()
-            }
-        return values
+        several = source.batch_shape or (len(draw["apply"]) != 1 and not all(map(_are_alike, values.values())))
+        if several and not isinstance(draw["apply"], list):
+            return values
+        return {n: value[0].tolist() if isinstance(value, np.ndarray) else value[0] for n, value in values.items()}
 
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         """Call `new_camera` with values as drawn."""

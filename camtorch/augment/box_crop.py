@@ -9,13 +9,11 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
-from camtorch.augment.ranges import as_range
+from camtorch.augment.ranges import RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.poses.rotations import mount_rotation
 from camtorch.values.arguments import as_known_size, as_whole
 from camtorch.warp.views import as_margin, check_extents, looking_at, pinhole
-
-RangeLike = float | Sequence[float]
 
 
 class BoxCrop(Augmentation):

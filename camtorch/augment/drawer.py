@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
-from typing_extensions import Self, Unpack
+from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, FilledOptions
 from camtorch.augment.change import Change, Drawn, Part, no_turn
@@ -20,7 +20,7 @@ from camtorch.augment.filling import enough, scaled
 from camtorch.augment.jitter import DRAWN, jittered
 from camtorch.augment.kinds import CHECKED, Form, check_values
 from camtorch.augment.presets import PRESETS
-from camtorch.augment.ranges import Range, as_range
+from camtorch.augment.ranges import Range, RangeLike, as_range, draw_shares
 from camtorch.augment.sample import Batch, Sample
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.catalogue import ELSEWHERE
@@ -38,7 +38,6 @@ from camtorch.warp.plan import SampleCall
 from camtorch.warp.vignetting import vignetting
 from camtorch.warp.warp import Warp
 
-RangeLike = float | Sequence[float]
 Auto = RangeLike | Literal["auto"] | None
 
 _REAL = "real"
@@ -140,7 +139,7 @@ class CameraDrawer(Augmentation):
 
     def _like_for(self, source: Camera) -> Camera | None:
         """Return `like`, on the CPU if the source is there and its numbers are known; None without `like`."""
-        like = self._held("like")
+        like = self.like
         return like if like is None or not source.intrinsics.is_cpu else twin_of(like) or like
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -205,7 +204,7 @@ class CameraDrawer(Augmentation):
 
         tensors = self._tensors_of(source)
         found = start() if self._is_real else self._memo(tensors, self._key(source, values, share), start)
-        own = self._held("like") is None and not self._is_real
+        own = self.like is None and not self._is_real
         return None if found is None else found.drawn(values, source if own else found.base, self.options)
 
     def _tensors_of(self, source: Camera) -> tuple[Tensor, ...]:
@@ -248,15 +247,18 @@ class CameraDrawer(Augmentation):
         known = self._memo.entry(self._tensors_of(batch.camera), key)
         if known is not None and known[2] is not None and known[2].is_quick and known[2].names == [*self.ranges]:
             options, ranges, *more = self._settings()
-            form.ready = Ready.of(form, names, call, key, ({**options}, {**ranges}, *more))
+            rest = [(name, found) for name, found in form.fields if name not in names]
+            checked = [(name, found) for name, found in rest if found in CHECKED]  # the call looks at the others
+            turns = all(name != "rotation" for name, _ in form.fields)
+            form.ready = Ready(({**options}, {**ranges}, *more), key, names, call, rest, checked, turns)
 
     def _settings(self) -> tuple[Any, ...]:
         """Return what the calls for samples of a form depend on, in addition to the form and the cameras' numbers."""
-        own = self.mask_fill, self.min_filled, self.image_size, self.valid_mask, self._held("like")
+        own = self.mask_fill, self.min_filled, self.image_size, self.valid_mask, self.like
         return self.options, self.ranges, *own
 
     def _quickly(self, sample: Sample, generator: torch.Generator | None) -> tuple[Sample | None, Any]:
-        camera = self._held("camera") if (given := sample.get("camera")) is None else given
+        camera = self.camera if (given := sample.get("camera")) is None else given
         key, settings = self._form_of(sample, camera, self.fields), self._settings()
         entry = None if key is None else self._forms.entry((), key)
         form: Form | None = None if entry is None else entry[2]
@@ -268,7 +270,9 @@ class CameraDrawer(Augmentation):
             form.is_tried, form.ready = False, None
             return None, None
         options, *_, like = settings
-        applied, numbers, spans = self._numbers_of_one(generator)
+        gate, shares, spans = draw_shares(self.ranges, 1, self.p, generator, self._spans)
+        self.__dict__["_spans"] = spans
+        applied, numbers = self.p >= 1 if gate is None else bool(gate), spans.numbers(shares.tolist())
         tensors = camera._tensors if like is None else (*camera._tensors, *like._tensors)
         fields = [sample[name] for name in ready.names]
         known = self._memo.entry(tensors, ready.key) if applied and are_free(*tensors, *fields) else None
@@ -281,7 +285,8 @@ class CameraDrawer(Augmentation):
             if one is not None and moved is not None and None not in moved:
                 base = camera if like is None else start.base
                 self.__dict__["_is_first"] = ready.turns
-                self.__dict__["_last"] = partial(_change_of, start, one, base, {**options}, camera)
+                drawn_again = partial(start.again, one, base, options.copy())
+                self.__dict__["_last"] = lambda: Change(1, [Part(None, drawn_again(), camera)])
                 return self._sample_after(sample, ready, start, one, base, moved), None
         return None, {"apply": [applied], **spans.named(numbers)}
 
@@ -299,7 +304,7 @@ class CameraDrawer(Augmentation):
             if self.min_filled:
                 self._tell_of(change.parts[0].camera, cast("Drawn", change.parts[0].moves))
             for name, found in ready.rest:
-                value, valid = self._one(change, found, sample[name].unsqueeze(0), {"mask_fill": self.mask_fill})
+                value, valid = self._one(change, found, sample[name][None], {"mask_fill": self.mask_fill})
                 result[name] = value.squeeze(0)
                 if valid is not None:
                     result[f"{name}_valid"] = valid.squeeze(0)
@@ -408,19 +413,6 @@ class Ready(NamedTuple):
     rest: list[tuple[str, str]]  # names and kinds of the other fields
     checked: list[tuple[str, str]]  # of those whose values are checked
     turns: bool  # whether the rotation comes out as a new field
-
-    @classmethod
-    def of(
-        cls, form: Form, names: list[str], call: SampleCall, key: tuple[Any, ...], settings: tuple[Any, ...]
-    ) -> Self:
-        """Return it for a form."""
-        rest = [(name, found) for name, found in form.fields if name not in names]
-        checked = [(name, found) for name, found in rest if found in CHECKED]  # the call looks at the others
-        return cls(settings, key, names, call, rest, checked, all(name != "rotation" for name, _ in form.fields))
-
-
-def _change_of(start: Start, one: One, base: Camera, options: Any, camera: Camera) -> Change:
-    return Change(1, [Part(None, start.again(one, base, options), camera)])
 
 
 def _joined(numbers: Sequence[Tensor], like: Tensor) -> Tensor:

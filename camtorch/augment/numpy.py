@@ -103,7 +103,7 @@ class Transform(FrontEnd):
         sample = {**(sample or {}), **fields}
         if sample.get("camera") is None and otherwise is not None:
             sample["camera"] = otherwise
-        camera = self.augmentation._held("camera") if sample.get("camera") is None else sample["camera"]
+        camera = self.augmentation.camera if sample.get("camera") is None else sample["camera"]
         size = getattr(camera, "image_size", None)
         own, form = self.augmentation, _form_of(sample)
         options = {key: value for key, value in options.items() if value is not None}

@@ -12,10 +12,10 @@ from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import FilledOptions
 from camtorch.augment.change import Part
-from camtorch.augment.drawer import Auto, CameraDrawer, LensOptions, RangeLike
+from camtorch.augment.drawer import Auto, CameraDrawer, LensOptions
 from camtorch.augment.kinds import Named
 from camtorch.augment.presets import PresetName
-from camtorch.augment.ranges import as_range
+from camtorch.augment.ranges import RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.warp.shifted import ShiftedWarp
 

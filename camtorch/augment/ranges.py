@@ -15,7 +15,8 @@ from torch import Tensor
 from camtorch.evaluate.known import are_free
 from camtorch.values.arguments import as_number, shown, warn
 
-_CPU = torch.device("cpu")
+RangeLike = float | Sequence[float]
+
 _RADIANS = 0.8  # 45 degrees: a range of degrees within it is more likely in radians
 
 
@@ -155,7 +156,7 @@ def draw_shares(
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
     if spans is None or spans.rows != rows or spans.ranges != ranges:
         spans = Spans(ranges, rows)
-    device = _CPU if generator is None else generator.device
+    device = "cpu" if generator is None else generator.device
     gate = torch.rand(rows, generator=generator, dtype=torch.float32, device=device) < p if 0 < p < 1 else None
     # in float64, so that what is drawn is what every precision sees
     return gate, torch.rand(spans.total, generator=generator, dtype=torch.float64, device=device), spans

@@ -255,10 +255,6 @@ class SampleTransform(KeepsCamera, nn.Module):
             f"{', '.join(named)}. For a camera, {how}"
         )
 
-    def _held(self, name: str) -> Camera | None:
-        """Return a camera of its own from the dict that holds it; `nn.Module` looks into all."""
-        return cast("Camera | None", self._modules.get(name))
-
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
         """Return the sample and the keyword arguments as one dict."""
         if not (sample is None or hasattr(sample, "keys")):
@@ -288,9 +284,11 @@ class SampleTransform(KeepsCamera, nn.Module):
             if name in OWN or value is None:
                 continue
             found = kind_of(name, value, fields, self._name, single)
-            if found is not None:
-                several = isinstance(value, (list, tuple))
-                named[name] = found, value if several else as_tensor(value, name, found, self._name)
+            if found is not None and isinstance(value, (list, tuple)):
+                items = [as_tensor(v, f"{name}[{i}]", found, self._name) for i, v in enumerate(value)]
+                named[name] = found, items
+            elif found is not None:
+                named[name] = found, as_tensor(value, name, found, self._name)
         return named
 
     def _batch(
@@ -302,19 +300,15 @@ class SampleTransform(KeepsCamera, nn.Module):
         values may be bad. kinds: name -> kind, in addition to `fields`.
         """
         camera = sample.get("camera") if camera is None else camera
-        camera = self._held("camera") if camera is None else camera
+        camera = self.camera if camera is None else camera
         fields = {**self.fields, **kinds} if kinds else self.fields
         key = self._form_of(sample, camera, fields)
         known = None if key is None else self._forms.entry((), key)
         if known is None:
             result = self._checked_batch(sample, camera, fields, predicted)
-            if (
-                key is not None
-                and result.camera is camera
-                and all(
-                    found in IMAGES or sample[name].dtype.is_floating_point for name, (found, _) in result.named.items()
-                )
-            ):
+            if key is None or result.camera is not camera:
+                return result
+            if all(kind in IMAGES or sample[n].dtype.is_floating_point for n, kind in result.form.fields):
                 self._forms((), key, lambda: result.form)
             return result
         form: Form = known[2]
@@ -322,9 +316,8 @@ class SampleTransform(KeepsCamera, nn.Module):
             for name, found in form.fields:
                 if found in CHECKED:
                     check_values(found, name, sample[name], self._name)
-        if form.batched:
-            return Batch({name: (found, sample[name]) for name, found in form.fields}, form, camera)
-        return Batch({name: (found, sample[name].unsqueeze(0)) for name, found in form.fields}, form, camera)
+        values = {n: (kind, sample[n] if form.batched else sample[n].unsqueeze(0)) for n, kind in form.fields}
+        return Batch(values, form, camera)
 
     def _form_of(self, sample: Sample, camera: object, fields: Mapping[str, str]) -> tuple[Any, ...] | None:
         """Return all that is checked of a sample but values; None if a field is no tensor or number, or of a Mixed."""
@@ -332,15 +325,8 @@ class SampleTransform(KeepsCamera, nn.Module):
             return None
         intrinsics, distortion = camera._tensors
         # each thread has calls of its own
-        parts: list[Any] = [
-            get_ident(),
-            type(sample),
-            type(camera),
-            camera.image_size,
-            intrinsics.shape,
-            distortion.shape,
-        ]
-        parts += intrinsics.dtype, intrinsics.device
+        parts: list[Any] = [get_ident(), type(sample), type(camera), camera.image_size]
+        parts += intrinsics.shape, intrinsics.dtype, intrinsics.device, distortion.shape
         for name, value in sample.items():
             if isinstance(value, Tensor):
                 parts += name, type(value), value.shape, value.stride(), value.dtype, value.device
@@ -360,10 +346,8 @@ class SampleTransform(KeepsCamera, nn.Module):
             self._sorted(sample, fields, single=True)  # raises for whole numbers of more than a row
         count = -1
         for name, (found, value) in named.items():
-            several = isinstance(value, (list, tuple))
-            items = (
-                [as_tensor(v, f"{name}[{i}]", found, self._name) for i, v in enumerate(value)] if several else [value]
-            )
+            several = isinstance(value, list)
+            items = value if several else [value]
             for i, item in enumerate(items):
                 which, more = f"{name}[{i}]" if several else name, item.ndim - KINDS[found].most_dims
                 frame = item.new_empty(item.shape[more:]) if more > 0 and isinstance(sample, Frames) else item
@@ -372,9 +356,9 @@ class SampleTransform(KeepsCamera, nn.Module):
                     check_values(found, which, item, self._name)
                     if "image" in named:
                         warn_of_numbers(found, which, item, f"{name}_valid" in sample, self._name)
-            value = items if several else value if batched else value.unsqueeze(0)
-            own = len(items) if several else items[0].shape[0] if batched else 1
-            named[name], count = (found, value), own if count < 0 else count
+            value = value if batched or several else value.unsqueeze(0)
+            named[name], own = (found, value), len(value)
+            count = own if count < 0 else count
             if own != count:
                 raise ValueError(f"{self._name}: {name} must be of {count} samples, as other fields; got {own}")
         self._check_cameras(camera, count, named, batched)
@@ -397,6 +381,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             )
         if several and len(cameras) != count:
             raise ValueError(f"{self._name}: camera must have one for each of {count} samples; got {len(cameras)}")
+        images = [(name, value) for name, (found, value) in named.items() if found in IMAGES]
         for i, one in enumerate(cameras):
             name = f"camera[{i}]" if several else "camera"
             shape = tuple(as_sized(one, name, self._name).batch_shape)
@@ -404,11 +389,10 @@ class SampleTransform(KeepsCamera, nn.Module):
                 raise ValueError(
                     f"{self._name}: {name} must have no batch dims, or those of {count} samples; got {shape}"
                 )
-            for field, (found, value) in named.items():
-                if found in IMAGES:
-                    shapes = [v.shape for v in value] if isinstance(value, list) else [value.shape[not batched :]]
-                    for shape in shapes[i : i + 1] if several and isinstance(value, list) else shapes:
-                        self._check_size(field, tuple(shape), name, one.image_size)
+            for field, value in images:
+                shapes = [v.shape for v in value] if isinstance(value, list) else [value.shape[not batched :]]
+                for shape in shapes[i : i + 1] if several and isinstance(value, list) else shapes:
+                    self._check_size(field, tuple(shape), name, one.image_size)
         self._check_one_size("camera", {one.image_size for one in cameras})
 
     def _check_one_size(self, name: str, sizes: set[tuple[int, int]]) -> None:
@@ -468,10 +452,8 @@ class SampleTransform(KeepsCamera, nn.Module):
         options: dict[str, float] = {"mask_fill": self.mask_fill}
         if self.mirroring is not None:
             options["lateral"] = self.mirroring.lateral
-
-        known = {}
-        if not self.valid_mask and sample.get("image_valid") is None:
-            known = together(change, named, batch.form, **options)
+        alike = not self.valid_mask and sample.get("image_valid") is None
+        known = together(change, named, batch.form, **options) if alike else {}
         for name, (found, value) in named.items():
             valid: Any
             if name in known:
@@ -528,26 +510,24 @@ class SampleTransform(KeepsCamera, nn.Module):
             moved[name] = [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
         pixels = [one for kind, value in named.values() for one in _items(value) if kind in ("keypoints", "landmarks")]
         faces = {tuple(one.shape[1:3]) for one in pixels if one.ndim == 4}  # (F, N)
+        keys = {key for name in (*named, *kept) for key in (name, f"{name}_valid") if key in moved}
+        single = {key for key in keys if not (batched or isinstance(moved[key], list))}
+        moved |= {key: moved[key][None] for key in single}
         for name, (found, _) in {**named, **kept}.items():
             for key, flags in ((name, found is None), (f"{name}_valid", True)):
-                if key not in moved:
+                if key not in keys:
                     continue
-                now, single = moved[key], not (batched or isinstance(moved[key], list))
-                items = _items(now[None] if single else now)
+                items = _items(moved[key])
                 rows = torch.zeros(sum(map(len, items)), dtype=torch.bool) if mirrored is None else mirrored
-                each = rows.split(1) if isinstance(now, list) else [rows]
+                each = rows.split(1) if isinstance(moved[key], list) else [rows]
                 pairs = zip(items, each, strict=False)
                 swapped = [mirroring.swapped(name, found, value, row, flags, faces) for value, row in pairs]
-                moved[key] = (
-                    [v[0] for v in swapped] if isinstance(now, list) else swapped[0][0] if single else swapped[0]
-                )
+                moved[key] = [v[0] for v in swapped] if isinstance(moved[key], list) else swapped[0]
         for left, right in sides if mirrored is not None else ():
-            for pair in ((left, right), (f"{left}_valid", f"{right}_valid")):
-                if all(key in moved for key in pair):
-                    single = not (batched or isinstance(moved[pair[0]], list))
-                    one, other = (moved[key].unsqueeze(0) if single else moved[key] for key in pair)
-                    for key, new in zip(pair, exchanged(one, other, cast("Tensor", mirrored)), strict=True):
-                        moved[key] = new.squeeze(0) if single else new
+            for one, other in ((left, right), (f"{left}_valid", f"{right}_valid")):
+                if one in keys and other in keys:
+                    moved[one], moved[other] = exchanged(moved[one], moved[other], cast("Tensor", mirrored))
+        moved |= {key: moved[key][0] for key in single}
 
     @staticmethod
     def _one(change: Change, found: str, value: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor | None]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -10,7 +10,7 @@ from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.change import Part
-from camtorch.augment.ranges import as_range
+from camtorch.augment.ranges import RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import one_of
 from camtorch.warp.shutter import DIRECTIONS, Direction, RollingShutter, ShutterWarp
@@ -39,8 +39,8 @@ class RandomShutter(Augmentation):
 
     def __init__(
         self,
-        readout: float | Sequence[float],
-        rates: float | Sequence[float],
+        readout: RangeLike,
+        rates: RangeLike,
         *,
         direction: Direction = "down",
         **options: Unpack[EditOptions],
