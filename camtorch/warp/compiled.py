@@ -19,14 +19,6 @@ from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
 from camtorch.warp.sampling import MODES, PADDINGS, Sampler, render
 
 
-def positions(
-    source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, padding: str
-) -> tuple[Tensor, Tensor]:
-    """Return positions (B or 1, H', W', 2) of all target pixels, and whether they are mapped, without gradients."""
-    planes, mapped = _positions(source, target, rotation, tolerance, padding)
-    return planes.movedim(1, -1), mapped
-
-
 def _count(rotation: Tensor | None, *numbers: Tensor) -> int:
     """Return the number of cameras, of rotations (*B, 3, 3) and numbers (*B, n)."""
     shapes = [t.shape[:-1] for t in numbers] + ([] if rotation is None else [rotation.shape[:-2]])
@@ -43,10 +35,10 @@ def _shapes(source: CameraNumbers, target: CameraNumbers, rotation: Tensor | Non
 
 
 @opaque(_shapes)
-def _positions(
+def positions(
     source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, padding: str
 ) -> tuple[Tensor, Tensor]:
-    """Return the positions, planes (B or 1, 2, H', W'), and whether they are mapped, (B or 1, H', W') bool."""
+    """Return the positions of all target pixels, planes (B or 1, 2, H', W'), and whether they are mapped."""
     grid, mapped = tabulate(source, target, rotation, tolerance, padding=padding)
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
 
@@ -102,12 +94,12 @@ def _warp(
     """Return images (B, C, h, w), plane by plane or with their channels last in memory; see `warped`."""
     antialias, padding, mode, padding_mode, fill, is_last = options
 
-    def positions() -> Sampling | Lattice:
+    def found() -> Sampling | Lattice:
         every = range(target._size_for("Warp")[0])
         return locate(source, target, rotation, tolerance, antialias == "True", every, padding)
 
     inputs = [*source._tensors, *target._tensors, *([] if rotation is None else [rotation])]
-    where = _located(inputs, (source._form, target._form, tolerance, antialias, padding, rotation is None), positions)
+    where = _located(inputs, (source._form, target._form, tolerance, antialias, padding, rotation is None), found)
     how = one_of(mode, MODES, "mode", "Warp"), one_of(padding_mode, PADDINGS, "padding_mode", "Warp")
     values = tuple(ast.literal_eval(f"({fill},)"))
     return (laid(render(images, where, *how, values), is_last),)

@@ -150,13 +150,9 @@ def scaled_rows(
 ) -> Sampling:
     """Return the `positions` of rows of a target with their scale, which is that between neighbours."""
     around = range(max(rows.start - 1, 0), min(rows.stop + 1, height))
-    where = scaled(source, *positions(around))
+    grid, mapped = positions(around)
+    where = Sampling(grid, mapped, local_scale(grid.detach(), mapped, source))
     return where if around == rows else where.part(slice(rows.start - around.start, rows.stop - around.start))
-
-
-def scaled(source: Camera, grid: Tensor, mapped: Tensor) -> Sampling:
-    """Return positions with the scale that antialiasing uses."""
-    return Sampling(grid, mapped, local_scale(grid.detach(), mapped, source))
 
 
 @on_one_thread
@@ -173,7 +169,7 @@ def tabulate(
     rows = range(height) if rows is None else rows
     like = _like(target)
     if is_unknown(target.intrinsics):
-        return _positions(source, target, rotation, None, _pixels(rows, width, like))
+        return _positions(source, target, rotation, None, pixels_of_rows(target, rows))
     if tolerance and like.is_cpu:
         lattice = on_lattice(source, target, rotation, tolerance, rows, padding)
         if lattice is not None:
@@ -183,14 +179,14 @@ def tabulate(
     count = max(math.prod(c.batch_shape) for c in (source, target))
     count = count if rotation is None else max(count, math.prod(rotation.shape[:-2]))
     step = max(_STRIP // max(count * width, 1), 1)
-    part, seen = exact(_pixels(rows[:step], width, like))
+    part, seen = exact(pixels_of_rows(target, rows[:step]))
     if len(rows) <= step:
         return part, seen
     grid, mapped = (t.new_empty(len(t), len(rows), *t.shape[2:]) for t in (part, seen))
     grid[:, :step], mapped[:, :step] = part, seen
     for i in range(step, len(rows), step):
         here = slice(i, i + step)
-        grid[:, here], mapped[:, here] = exact(_pixels(rows[here], width, like))
+        grid[:, here], mapped[:, here] = exact(pixels_of_rows(target, rows[here]))
     return grid, mapped
 
 
@@ -206,16 +202,12 @@ def _like(target: Camera) -> Tensor:
     return like if like.dtype.itemsize >= 4 else like.float()
 
 
-def _pixels(rows: range, width: int, like: Tensor) -> Tensor:
-    """Return the centres of the pixels, (len(rows), width, 2)."""
-    v = torch.arange(rows.start, rows.stop, dtype=like.dtype, device=like.device)
-    u = torch.arange(width, dtype=like.dtype, device=like.device)
-    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
-
-
 def pixels_of_rows(target: Camera, rows: range) -> Tensor:
     """Return the centres of a target's pixels, (len(rows), W', 2), in the dtype to compute positions in."""
-    return _pixels(rows, target._size_for("Warp")[1], _like(target))
+    like = _like(target)
+    v = torch.arange(rows.start, rows.stop, dtype=like.dtype, device=like.device)
+    u = torch.arange(target._size_for("Warp")[1], dtype=like.dtype, device=like.device)
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
 
 
 def _positions(
@@ -288,7 +280,7 @@ def on_lattice(
     if native is None and not are_free(like):
         return None
     nodes, size = (n + 5) * (m + 5), source._size_for("Warp")
-    pixels = kept_probes(rows, width, like.dtype) if nodes <= MOST_KEPT else _probes(rows, width, like)
+    pixels = (kept_probes if nodes <= MOST_KEPT else kept_probes.__wrapped__)(rows, width, like.dtype)
     if native is not None:
         made = native.lattices(pixels, (height, width), rows.start, tolerance, padding)
         return None if made is None else Lattice(*made, (height, width))
@@ -320,27 +312,22 @@ def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype
     return Lattice(nodes, cells, nodes.new_empty(2, 0, STEP, STEP), (len(rows), width))
 
 
-def _probes(rows: range, width: int, like: Tensor) -> Tensor:
-    """Return the nodes of a lattice, and the pixels at the rim of the target, (1, N, 2)."""
-    # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
-    v, u = (
-        (torch.arange(math.ceil(side / STEP) + 5, dtype=like.dtype, device=like.device) - 2) * STEP
-        for side in (len(rows), width)
-    )
-    nodes = torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"))
-    # (2 (w + h), 2): the pixels of the first and the last row, and of the first and the last column
-    down, across = (torch.arange(length, dtype=like.dtype, device=like.device) for length in (len(rows), width))
-    down += rows.start
-    sides = [(across, torch.full_like(across, end)) for end in (rows[0], rows[-1])]
-    sides += [(torch.full_like(down, end), down) for end in (0, width - 1)]
-    return torch.cat((nodes.flatten(1), torch.cat([torch.stack(pair, -1) for pair in sides]).mT), 1).mT[None]
-
-
 @lru_cache(maxsize=8)
 def kept_probes(rows: range, width: int, dtype: torch.dtype) -> Tensor:
     """Return the nodes of a lattice, and then the pixels at the rim of the target, (1, N, 2) on the CPU."""
     with torch.inference_mode(False):
-        return _probes(rows, width, torch.empty(0, dtype=dtype, device="cpu"))
+        down, across = (torch.arange(length, dtype=dtype, device="cpu") for length in (len(rows), width))
+        # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
+        v, u = (
+            (torch.arange(math.ceil(side / STEP) + 5, dtype=dtype, device="cpu") - 2) * STEP
+            for side in (len(rows), width)
+        )
+        nodes = torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"))
+        # (2 (w + h), 2): the pixels of the first and the last row, and of the first and the last column
+        down += rows.start
+        sides = [(across, torch.full_like(across, end)) for end in (rows[0], rows[-1])]
+        sides += [(torch.full_like(down, end), down) for end in (0, width - 1)]
+        return torch.cat((nodes.flatten(1), torch.cat([torch.stack(pair, -1) for pair in sides]).mT), 1).mT[None]
 
 
 def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor) -> Tensor:

@@ -52,7 +52,7 @@ from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.native_cameras import Native, entry
 from camtorch.values.threads import spread, thread_count
 from camtorch.warp import compiled
-from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, Lattice, Sampling, coarse, kept_probes, scaled
+from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, Lattice, Sampling, coarse, kept_probes, local_scale
 from camtorch.warp.pair import CameraPair, Plan
 from camtorch.warp.panorama import goes_round
 from camtorch.warp.sampling import (
@@ -193,10 +193,9 @@ def _computed(warp: CameraPair, reach: PaddingMode) -> Sampling | Lattice:
         return positions(host, "kept", reach).on(warp.target.intrinsics.device)
     if not (_is_operator(warp) and warp.tolerance and warp.target.intrinsics.is_cpu):
         return warp._locate(range(warp.target._size_for("Warp")[0]), reach, warp.tolerance)
-    grid, mapped = compiled.positions(warp._sampled, warp.target, warp.rotation, warp.tolerance, reach)
-    if warp.antialias:
-        return scaled(warp._sampled, grid, mapped)
-    return Sampling(grid, mapped, None)
+    planes, mapped = compiled.positions(warp._sampled, warp.target, warp.rotation, warp.tolerance, reach)
+    grid = planes.movedim(1, -1)
+    return Sampling(grid, mapped, local_scale(grid, mapped, warp._sampled) if warp.antialias else None)
 
 
 def strips(
@@ -220,19 +219,11 @@ def in_strips(
     images = lengthened(warp, images)
     for rows, where in strips(warp, sampler.padding_mode, count):
         with torch.no_grad():
-            part, valid = render(images, where, *sampler, kept), _on_image(warp, where)
+            part, valid = render(images, where, *sampler, kept), on_image(warp, where)
         yield rows, part, valid
 
 
-@torch.no_grad()
-def valid_mask(warp: CameraPair) -> Tensor:
-    """See `Warp.valid_mask`."""
-    if route_of(warp) == "strips":
-        return torch.cat([_on_image(warp, where) for _, where in strips(warp)], 2)
-    return _on_image(warp, positions(warp, "kept"))
-
-
-def _on_image(warp: CameraPair, where: Sampling | Lattice) -> Tensor:
+def on_image(warp: CameraPair, where: Sampling | Lattice) -> Tensor:
     """Whether the source maps pixels onto its image, (B or 1, 1, h, W')."""
     where = where.pixels if isinstance(where, Lattice) else where
     grid, source = where.grid.detach(), warp._sampled

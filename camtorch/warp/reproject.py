@@ -185,6 +185,4 @@ class Reproject(GeometryModule):
         return far.detach() <= furthest * (1 + tolerance)
 
     def extra_repr(self) -> str:
-        """Return the options."""
-        options: dict[str, Any] = {"mode": self.mode, "padding_mode": self.padding_mode, "fill": self.fill}
-        return ", ".join(f"{name}={value!r}" for name, value in options.items())
+        return f"mode={self.mode!r}, padding_mode={self.padding_mode!r}, fill={self.fill!r}"

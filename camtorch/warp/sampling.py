@@ -117,7 +117,6 @@ def by_torch(
 def _by_torch(images: Tensor, where: Sampling | Lattice, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
     """Sample B images by `grid_sample`."""
     count, dtype = images.shape[0], images.dtype
-    plain = are_plain(images)
     wide, finite = dtype == wide_dtype(dtype), not dtype.is_floating_point
     if isinstance(where, Lattice):
         where = where.pixels
@@ -136,7 +135,7 @@ def _by_torch(images: Tensor, where: Sampling | Lattice, how: Sampler, kept: dic
         picked = pixels.gather(2, index.expand(*images.shape[:2], -1)).view(images.dtype)
         return torch.where(seen.unsqueeze(1), picked.unflatten(2, where.grid.shape[1:3]), value)
     where = where._replace(grid=converted(where.grid, wide_dtype(dtype)))
-    plain = plain and are_plain(where.grid)
+    plain = are_plain(images, where.grid)
     large = plain and not wide and math.prod(images.shape[1:]) > _LARGE
     # the same for all strips of an image, however many cores are free: the pyramids that they keep are of these parts
     step = count if wide or not plain else 1 if large else thread_count()
@@ -230,16 +229,13 @@ class Pyramid:
     def half(self) -> Pyramid:
         """They are of a dtype to compute in."""
         if self._half is None:  # no cached_property, whose lock compilers refuse
-            self._half = self._halved()
+            size = [max(side // 2, 1) for side in self.images.shape[-2:]]
+            # a copy in another dtype is large
+            step = 1 if self.images.dtype != wide_dtype(self.images.dtype) else self.images.shape[1]
+            options: Any = {"mode": "bilinear", "align_corners": False, "antialias": True}
+            halves = [F.interpolate(widen(part), size, **options) for part in self.images.split(step, 1)]
+            self._half = Pyramid(torch.cat(halves, 1), self.finite)
         return self._half
-
-    def _halved(self) -> Pyramid:
-        size = [max(side // 2, 1) for side in self.images.shape[-2:]]
-        # a copy in another dtype is large
-        step = 1 if self.images.dtype != wide_dtype(self.images.dtype) else self.images.shape[1]
-        channels = self.images.split(step, 1)
-        halves = [F.interpolate(widen(c), size, mode="bilinear", align_corners=False, antialias=True) for c in channels]
-        return Pyramid(torch.cat(halves, 1), self.finite)
 
 
 def _minified(

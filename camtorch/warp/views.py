@@ -135,8 +135,7 @@ class Views(GeometryModule):
         return result, valid
 
     def extra_repr(self) -> str:
-        """Return the names of the views."""
-        return f"{', '.join(self.names)}"
+        return ", ".join(self.names)
 
 
 @hinting("It takes cube(camera, size), with size the sides of a face in pixels")
@@ -258,13 +257,18 @@ def check_extents(boxes: Tensor, camera: Camera, owner: str) -> None:
     limits = boxes.new_tensor((camera.width, camera.height)) - 0.5
     low, high = boxes.split(2, -1)
     for wrong, what in (
-        (~torch.isfinite(boxes).all(-1), "must be finite"),
-        (~(low < high).all(-1), "must have a width and a height: x1 < x2 and y1 < y2"),
-        (~((low < limits) & (high > -0.5)).all(-1), f"must be on the image, {camera.width} x {camera.height}, in part"),
+        (~torch.isfinite(boxes).all(-1), "be finite"),
+        (~(low < high).all(-1), "have a width and a height: x1 < x2 and y1 < y2"),
+        (~((low < limits) & (high > -0.5)).all(-1), f"be on the image, {camera.width} x {camera.height}, in part"),
     ):
-        if bool(wrong.any()):
-            i = int(wrong.nonzero()[0])
-            raise ValueError(f"{owner}: boxes {what}; got boxes[{i}] = {boxes[i].tolist()}")
+        _refuse(wrong, boxes, what, owner)
+
+
+def _refuse(wrong: Tensor, boxes: Tensor, what: str, owner: str) -> None:
+    """Raise a ValueError that names the first of `boxes` (B, 4) at which `wrong` (B,) is True, if there is one."""
+    if bool(wrong.any()):
+        i = int(wrong.nonzero()[0])
+        raise ValueError(f"{owner}: boxes must {what}; got boxes[{i}] = {boxes[i].tolist()}")
 
 
 @torch.no_grad()
@@ -272,19 +276,14 @@ def looking_at(
     camera: Camera, boxes: Tensor, size: tuple[int, int], margin: float, owner: str
 ) -> tuple[Tensor, Tensor]:
     """Return intrinsics (B, 4) and rotations (B, 3, 3), in float64, of the cameras of `look_at` for boxes (B, 4)."""
-
-    def refuse(wrong: Tensor, what: str) -> None:
-        if bool(wrong.any()):
-            i = int(wrong.nonzero()[0])
-            raise ValueError(f"{owner}: boxes must {what}; got boxes[{i}] = {boxes[i].tolist()}")
-
     low, high = boxes.detach().double().split(2, -1)
     axis, has_ray = camera.unproject((low + high) / 2)
-    refuse(~has_ray, "have a middle that the lens sees")
+    _refuse(~has_ray, boxes, "have a middle that the lens sees", owner)
     axis = axis / axis.norm(dim=-1, keepdim=True)
     across = torch.stack((axis[:, 2], torch.zeros_like(axis[:, 0]), -axis[:, 0]), -1)
     length = across.norm(dim=-1, keepdim=True)
-    refuse(length[:, 0] < _STRAIGHT_UP, "lie off the camera's y axis, along which no direction is up")
+    what = "lie off the camera's y axis, along which no direction is up"
+    _refuse(length[:, 0] < _STRAIGHT_UP, boxes, what, owner)
     across = across / length
     rotation = torch.stack((across, torch.linalg.cross(axis, across), axis), -2)
     moved = margin * (high - low)
@@ -300,7 +299,7 @@ def looking_at(
         turned, seen = (rays @ rotation.mT).view(*share.shape, 3), seen.view(share.shape)
         all_seen = all_seen and bool(seen.all())
         behind = (seen & (turned[..., 2] <= 1e-9)).flatten(1).any(-1)
-        refuse(behind, "have an outline less than 90 degrees from the middle")
+        _refuse(behind, boxes, "have an outline less than 90 degrees from the middle", owner)
         slopes = turned[..., :2].abs() / turned[..., 2:].clamp(min=1e-9)
         slopes = torch.where(seen[..., None], slopes, -math.inf)
         slopes = slopes.expand(-1, -1, 2, -1, -1).diagonal(dim1=2, dim2=4).mT  # (B, 4, 2, K)
@@ -309,7 +308,7 @@ def looking_at(
         if i == _ROUNDS - 1 and all_seen:
             break
         place, half = share.expand(*best.shape, -1).gather(-1, index[..., None])[..., 0], 2 * half / (_ALONG - 1)
-    refuse(~torch.isfinite(farthest).all(-1), "have an outline that the lens sees")
+    _refuse(~torch.isfinite(farthest).all(-1), boxes, "have an outline that the lens sees", owner)
     sides = farthest.new_tensor(size[::-1])
     focal = (sides / 2 / farthest).amin(-1, keepdim=True).expand(-1, 2)
     return torch.cat((focal, ((sides - 1) / 2).expand_as(focal)), -1), rotation

@@ -236,7 +236,10 @@ class Warp(CameraPair):
 
     def valid_mask(self) -> Tensor:
         """Return (B or 1, 1, H', W') bool: whether the pixel has a ray, and the source sees it on its image."""
-        return plan.valid_mask(self)
+        with torch.no_grad():
+            if plan.route_of(self) == "strips":
+                return torch.cat([plan.on_image(self, where) for _, where in plan.strips(self)], 2)
+            return plan.on_image(self, plan.positions(self, "kept"))
 
     def pin(self) -> Warp:
         """Compute the grid once, with its graph, for a warp whose cameras will not change; return the warp."""
@@ -330,11 +333,7 @@ class Warp(CameraPair):
 
 
 def checked(
-    warp: Warp,
-    images: Tensor,
-    mode: Mode | None = None,
-    padding_mode: PaddingMode | None = None,
-    fill: Fill | None = None,
+    warp: Warp, images: Tensor, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None
 ) -> Sampler:
     """Return how a warp samples images in one call; raise if images or options are wrong."""
     expected = warp.source._size_for("Warp")
