@@ -27,7 +27,7 @@ from scenes.faces import Samples
 from scenes.reader import Network, loss_of, medians
 
 import camtorch as ct
-from camtorch.plot.axes import COLOURS
+from camtorch.plot.figures import COLOURS
 
 NUMBERS = Path(__file__).with_suffix(".json")
 

@@ -9,7 +9,7 @@ import numpy as np
 from camtorch.analysis.numbers import difference, summarise
 from camtorch.cli import images, targets
 from camtorch.cli.cameras import read_other, read_rig
-from camtorch.plot.axes import require_matplotlib
+from camtorch.plot.figures import require_matplotlib
 from camtorch.viewer.viewer import write_viewer
 
 

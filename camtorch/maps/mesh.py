@@ -68,11 +68,8 @@ class Table(MapFormat):
         for p, shown in ((exact.positions, exact.shown), (exact.positions.swapaxes(0, 1), exact.shown.T)):
             leaps += int(((np.abs(np.diff(p, axis=0)) > half).any(-1) & shown[1:] & shown[:-1]).sum())
         if leaps:
-            raise CameraFileError(
-                path,
-                "mesh",
-                f"positions must not leap, as at the seam of a panorama; got leaps beside {leaps} pixels",
-            )
+            reason = f"positions must not leap, as at the seam of a panorama; got leaps beside {leaps} pixels"
+            raise CameraFileError(path, "mesh", reason)
         n, m = _counts(step, exact.target_size)
         down, across = np.nonzero(exact.shown)
         blocks = np.zeros((n + 1, m + 1), np.bool_)  # each node between its four blocks

@@ -82,9 +82,5 @@ def _fetched(path: str, positions: Floats, source: tuple[int, int]) -> tuple[tup
         if padding <= _MOST_PADDING:
             across, down = (last - first).reshape(-1, 2).max(0) + 1 + 2 * padding
             return size, padding, (int(down), int(across))
-    raise CameraFileError(
-        path,
-        "pixel padding",
-        f"blocks of {size[1]}x{size[0]} must need at most {_MOST_PADDING} pixels around their corners' positions; got "
-        f"{padding}",
-    )
+    most = f"at most {_MOST_PADDING} pixels around their corners' positions"
+    raise CameraFileError(path, "pixel padding", f"blocks of {size[1]}x{size[0]} must need {most}; got {padding}")

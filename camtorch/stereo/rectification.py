@@ -16,15 +16,7 @@ from camtorch.evaluate.known import known_false
 from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, skew_matrix
-from camtorch.values.arguments import (
-    Numbers,
-    as_flag,
-    as_fov,
-    as_image_size,
-    as_values,
-    hinting,
-    one_of,
-)
+from camtorch.values.arguments import Numbers, as_flag, as_fov, as_image_size, as_values, hinting, one_of
 from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.arrays import Image
 from camtorch.warp.dewarp import middle_lines

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scenes import room
 
 import camtorch as ct
-from camtorch.plot.axes import COLOURS, GREY, INK, NO_RAYS
+from camtorch.plot.figures import COLOURS, GREY, INK, NO_RAYS
 from camtorch.rays.lattices import followed, image_lattice
 from drawings.pages import IMAGES, code, sections
 from drawings.sheets import GAP, WIDTH, drawn
