@@ -17,7 +17,7 @@ import numpy as np
 
 from camtorch.io.record import CameraFileError
 from camtorch.maps.lookup import Exact, Floats
-from camtorch.maps.mesh import Mesh, Table, held, rounded, table
+from camtorch.maps.mesh import Mesh, Table, rounded, table
 
 _PARTS = 16
 _MOST = (1 << 16) - 1
@@ -39,8 +39,7 @@ class DW100(Table):
                 reason = f"must be 176x144 to 4096x3072 pixels for the DW100; got {size[1]}x{size[0]}"
                 raise CameraFileError(path, f"{what} size", reason)
         low, high = np.zeros(2), np.full(2, _MOST / _PARTS)
-        mesh = held(path, self.name, mesh, low, high, clip=bool(options.get("clip")))
-        parts = rounded(mesh, exact, _PARTS, low, high)
+        parts = rounded(path, self.name, mesh, exact, _PARTS, low, high, bool(options.get("clip")))
         return (parts[..., 1] << 16 | parts[..., 0]).astype("<u4").tobytes(), {}
 
     def unpack(self, content: bytes, blank: Mesh) -> Floats:

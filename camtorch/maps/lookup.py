@@ -15,13 +15,13 @@ from torch import Tensor
 
 from camtorch.values.dtypes import narrow, widen
 from camtorch.warp.arrays import Image, warped_alike
+from camtorch.warp.grid import OUTSIDE
 from camtorch.warp.warp import Warp
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
 _STRIP = 1 << 19  # pixels computed at a time
-OUTSIDE = -9.0  # a position of `grid_sample` outside of all images
 _FAR = 100.0  # positions beyond are clamped, as in `Warp`: float32 and integers cannot hold all
 
 

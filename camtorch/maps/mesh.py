@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -142,8 +142,17 @@ def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats
     return nodes
 
 
-def held(path: str, format: str, mesh: Mesh, low: Floats, high: Floats, *, clip: bool) -> Mesh:
-    """Return the mesh with nodes clipped to `low` and `high`; raise, unless `clip`, if shown pixels are far off."""
+def rounded(
+    path: str, format: str, mesh: Mesh, exact: Exact, parts: int, low: Floats, high: Floats, clip: bool
+) -> np.ndarray:
+    """Return the nodes (n, m, 2) int64 in `parts` of a pixel, so that the largest error at shown pixels is small.
+
+    Each is one of the two neighbours of the exact value, from low to high. Interpolation cuts off bends, so nodes are
+    rounded outwards first; then those near the largest error are rounded to reduce it, as long as that helps.
+
+    Raises:
+        CameraFileError: If nodes of shown pixels are far below `low` or above `high`, unless `clip` is True.
+    """
     beyond = ((mesh.nodes < low - _SLACK) | (mesh.nodes > high + _SLACK)).any(-1)
     if mesh.needed is not None and not clip and (lost := beyond & mesh.needed).any():
         worst = mesh.nodes[lost]
@@ -154,20 +163,12 @@ def held(path: str, format: str, mesh: Mesh, low: Floats, high: Floats, *, clip:
             f"must fit in {format}; got x {left:.1f} to {right:.1f}, y {top:.1f} to {bottom:.1f} px of the source. "
             "clip=True (--clip) clips them, and the report has the error",
         )
-    return replace(mesh, nodes=mesh.nodes.clip(low, high))
-
-
-def rounded(mesh: Mesh, exact: Exact, parts: int, low: Floats, high: Floats) -> np.ndarray:
-    """Return the nodes (n, m, 2) int64 in `parts` of a pixel, so that the largest error at shown pixels is small.
-
-    Each is one of the two neighbours of the exact value, from low to high. Interpolation cuts off bends, so nodes are
-    rounded outwards first; then those near the largest error are rounded to reduce it, as long as that helps.
-    """
-    values, least, most = mesh.nodes * parts, low * parts, high * parts
-    total = np.zeros_like(mesh.nodes)  # sum of second differences along both axes; the ends copy their neighbours
+    held = mesh.nodes.clip(low, high)
+    values, least, most = held * parts, low * parts, high * parts
+    total = np.zeros_like(held)  # sum of second differences along both axes; the ends copy their neighbours
     for axis in (0, 1):
-        if mesh.nodes.shape[axis] > 2:
-            bend = np.diff(mesh.nodes, 2, axis)
+        if held.shape[axis] > 2:
+            bend = np.diff(held, 2, axis)
             total += np.concatenate((bend.take([0], axis), bend, bend.take([-1], axis)), axis)
     outside = (_OUTWARDS * total * parts).clip(-0.5, 0.5)
     nodes = np.rint(values - outside).clip(least, most)

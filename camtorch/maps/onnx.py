@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from camtorch.maps.lookup import OUTSIDE, Exact, LookupMap
+from camtorch.maps.lookup import Exact, LookupMap
 from camtorch.maps.protocol import MapFormat, checked
 from camtorch.values.arguments import imported
+from camtorch.warp.grid import OUTSIDE
 
 _OPSET, _IR = 16, 8
 _DTYPES = ("float32", "uint8")

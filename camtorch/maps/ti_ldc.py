@@ -21,7 +21,7 @@ import numpy as np
 
 from camtorch.io.record import CameraFileError
 from camtorch.maps.lookup import Exact, Floats
-from camtorch.maps.mesh import Mesh, Table, held, rounded, table
+from camtorch.maps.mesh import Mesh, Table, rounded, table
 
 _PARTS = 8
 _LOW, _HIGH = -(1 << 15), (1 << 15) - 1
@@ -46,8 +46,7 @@ class TILDC(Table):
             raise CameraFileError(path, "size", f"sides must be at most {_LARGEST} px for the LDC; got more")
         (n, m), places = mesh.nodes.shape[:2], mesh.places
         limits = places + _LOW / _PARTS, places + _HIGH / _PARTS
-        mesh = held(path, self.name, mesh, *limits, clip=bool(options.get("clip")))
-        parts = rounded(mesh, exact, _PARTS, *limits)
+        parts = rounded(path, self.name, mesh, exact, _PARTS, *limits, bool(options.get("clip")))
         lines = np.zeros((n, _pitch(m) // 2), "<i2")
         lines[:, : 2 * m] = (parts - places * _PARTS).reshape(n, -1)
         positions = replace(mesh, nodes=parts / _PARTS).positions(exact.target_size)

@@ -280,8 +280,7 @@ def _halvings(where: Sampling | Lattice, source: Camera) -> list[int]:
         planes = where.nodes[..., 2:-3, 2:-3]  # the nodes on the target's pixels
         planes = planes[..., first // STEP :: step // STEP, first // STEP :: step // STEP]
     else:
-        grid = where.pixels.grid if isinstance(where, Lattice) else where.grid
-        planes = grid.detach().movedim(-1, 1)[..., first::step, first::step]
+        planes = where.pixels.grid.detach().movedim(-1, 1)[..., first::step, first::step]
     seen = (planes.abs() <= 1).all(1)
     height, width = source._size_for("Warp")
     grid, planes = planes, planes * planes.new_tensor([width / 2, height / 2])[:, None, None]

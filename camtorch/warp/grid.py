@@ -47,6 +47,11 @@ class Sampling(NamedTuple):
     mapped: Tensor  # (B or 1, h, W') bool: the pixel has a ray, and the source maps it
     scale: Tensor | None  # (B or 1, h, W'): see `local_scale`; None where nobody asks for it
 
+    @property
+    def pixels(self) -> Sampling:
+        """Itself, as a `Lattice` has it."""
+        return self
+
     def cameras(self, rows: slice | Tensor) -> Sampling:
         """Return those of these cameras of the batch."""
         scale = None if self.scale is None else self.scale[rows]

@@ -183,8 +183,7 @@ def _plan_of(warp: CameraPair, make: Callable[[], Plan]) -> Plan:
 
 def by_pixel(warp: CameraPair) -> Sampling:
     """Return the positions of all pixels, one by one."""
-    where = positions(warp, "graph" if route_of(warp) == "graph" else "kept")
-    return where.pixels if isinstance(where, Lattice) else where
+    return positions(warp, "graph" if route_of(warp) == "graph" else "kept").pixels
 
 
 def _computed(warp: CameraPair, reach: PaddingMode) -> Sampling | Lattice:
@@ -225,10 +224,9 @@ def in_strips(
 
 def on_image(warp: CameraPair, where: Sampling | Lattice) -> Tensor:
     """Whether the source maps pixels onto its image, (B or 1, 1, h, W')."""
-    where = where.pixels if isinstance(where, Lattice) else where
-    grid, source = where.grid.detach(), warp._sampled
+    grid, source = where.pixels.grid.detach(), warp._sampled
     pixels = (grid + 1) * grid.new_tensor(source._size_for("Warp")[::-1]) / 2 - 0.5
-    return (where.mapped & source.contains(pixels)).unsqueeze(1)
+    return (where.pixels.mapped & source.contains(pixels)).unsqueeze(1)
 
 
 def pin(warp: CameraPair) -> None:
@@ -274,8 +272,7 @@ def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | Lattice | No
     with set_aside() if warp.is_pinned else with_values(warp):
 
         def own() -> Sampling:
-            where = positions(warp, "kept", padding)
-            where = where.pixels if isinstance(where, Lattice) else where
+            where = positions(warp, "kept", padding).pixels
             grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
             return where._replace(grid=grid, mapped=mapped)
 

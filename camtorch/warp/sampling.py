@@ -104,22 +104,21 @@ def by_torch(
     out: Tensor | None = None,
 ) -> Tensor:
     """Sample images (B or 1, C, H, W) by `grid_sample`; see `render`."""
-    cameras = where.cells.shape[0] if isinstance(where, Lattice) else where.grid.shape[0]
+    where = where.pixels
+    cameras = where.grid.shape[0]
     images = images if cameras == 1 else images.expand(cameras, -1, -1, -1)
-    if isinstance(where, Sampling) and how.mode == "nearest":
+    if how.mode == "nearest":
         where = where._replace(scale=None)
-    if isinstance(where, Sampling) and not images.dtype.is_floating_point:
+    if not images.dtype.is_floating_point:
         where = where._replace(grid=where.grid.detach())
     result = _by_torch(images, where, how, kept)
     return laid_as(images, result) if out is None else out.copy_(result)
 
 
-def _by_torch(images: Tensor, where: Sampling | Lattice, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
+def _by_torch(images: Tensor, where: Sampling, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
     """Sample B images by `grid_sample`."""
     count, dtype = images.shape[0], images.dtype
     wide, finite = dtype == wide_dtype(dtype), not dtype.is_floating_point
-    if isinstance(where, Lattice):
-        where = where.pixels
     if how.mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:
         # the nearest of integers (B, C, H, W), moved and not computed with: no float holds every id
         value = as_pixels(how.fill, images.dtype, images.device)
