@@ -139,10 +139,8 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         camera = camera_of(params, self.camera, device)
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
         inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
-        if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-            return self.augmentation.change(camera, values)
-        memo = self._memos[len(values["apply"]) == 1]
-        return memo(inputs, (str(self.augmentation.options),), lambda: self.augmentation.change(camera, values))
+        memo, options = self._memos[len(values["apply"]) == 1], (str(self.augmentation.options),)
+        return memo.unless_learning(inputs, options, lambda: self.augmentation.change(camera, values))
 
     @property
     def last(self) -> Change | None:

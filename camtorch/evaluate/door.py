@@ -178,16 +178,11 @@ def may_look(tensor: Tensor) -> bool:
 class Way(NamedTuple):
     """The way in which a call is evaluated."""
 
-    is_native: bool
-    """Whether compiled code evaluates the call, if it has the model."""
-    learns: bool
-    """Whether derivatives of compiled code are recorded."""
-    is_known: bool
-    """Whether the values of the parameters may be read, so that results made of them are kept."""
-    order: int
-    """The order of the derivatives that the recorded formula must have exactly."""
-    is_constant: bool = False
-    """Whether the module is a constant of the exported program."""
+    is_native: bool  # compiled code evaluates the call, if it has the model
+    learns: bool  # derivatives of compiled code are recorded
+    is_known: bool  # the values of the parameters may be read, so that results made of them are kept
+    order: int  # of the derivatives that the recorded formula must have exactly
+    is_constant: bool = False  # the module is a constant of the exported program
 
 
 _NATIVE, _LEARNING = Way(True, False, True, 2), Way(True, True, True, 2)

@@ -76,14 +76,10 @@ def repeat(
             moves, *state = step(moves, *state)
         return (moves, *state)
 
-    def goes_on(count: Tensor, moves: Tensor, *state: Tensor) -> Tensor:
-        return (count < most) & moves.any()
-
-    def body(count: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        return (count + 1, *step(*state))
-
     start = (torch.zeros((), dtype=torch.int64, device=moves.device), moves, *(w.clone() for w in state))
-    return while_loop(goes_on, body, start)[1:]
+    return while_loop(
+        lambda count, moves, *_: (count < most) & moves.any(), lambda count, *given: (count + 1, *step(*given)), start
+    )[1:]
 
 
 def piece_of(nodes: tuple[Tensor, ...], place: Tensor) -> Tensor:

@@ -57,6 +57,11 @@ class Kept:
                 return entry
         return None
 
+    def unless_learning(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], T]) -> T:
+        """Return `compute()` with its graph if an input learns, else as the call does."""
+        learns = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+        return compute() if learns else self(inputs, options, compute)
+
     def renew(self, compute: Callable[[], T]) -> T:
         """Return `compute()`, which is the result from now on."""
         if in_transform():  # a transform's tensors die with it

@@ -108,9 +108,7 @@ class Rectification(GeometryModule):
                 Warp(right, self.camera_right, other.to(right.intrinsics.dtype)),
             )
 
-        inputs = self.extrinsics.rotation, self.extrinsics.translation
-        learns = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-        return make() if learns else self._memo(inputs, (), make)
+        return self._memo.unless_learning((self.extrinsics.rotation, self.extrinsics.translation), (), make)
 
     def forward(self, left: Image, right: Image) -> tuple[Image, Image]:
         """Rectify both images, of the kinds that `Warp` takes."""
@@ -214,7 +212,6 @@ class Rectification(GeometryModule):
         return {"R1": self.rotation_left, "R2": self.rotation_right, "P1": first, "P2": first + shift, "Q": q}
 
     def extra_repr(self) -> str:
-        """Return the projection and the direction of correspondence in words."""
         return f"{self.projection}, {'columns' if self.vertical else 'rows'} correspond"
 
 

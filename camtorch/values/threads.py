@@ -159,8 +159,7 @@ def thread_count() -> int:
 
 
 class _Mine(threading.local):
-    threads = 0
-    """The number of threads before and after the function `on_one_thread`; 0 outside of one."""
+    threads = 0  # before and after the function `on_one_thread`; 0 outside of one
 
 
 def _find_limits() -> tuple[Callable[[int], object], Callable[[int], int]] | None:

@@ -20,6 +20,7 @@ from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
 from camtorch.warp.grid import STEP, Lattice, Sampling, coarse, straight_lattice
+from camtorch.warp.moving import placed
 from camtorch.warp.panorama import lengths
 from camtorch.warp.plan import Route, lengthened, positions, route_of, warped
 from camtorch.warp.sampling import SHRINKS, PaddingMode, Sampler, render
@@ -175,7 +176,6 @@ class AffineWarp(MirrorWarp):
         return {**super().__getstate__(), "map": self.map.detach() if isinstance(self.map, Tensor) else self.map}
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
-        """Return this edit between other cameras, with the same map of pixels; see `Warp.between`."""
         return AffineWarp(source, target, self.map, rotation, **options)
 
     def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
@@ -231,9 +231,7 @@ class AffineWarp(MirrorWarp):
         if matrix.ndim == 3:
             matrix = matrix.reshape(-1, *[1] * (pixels.ndim - 2), 2, 3)
         moved = (matrix[..., :2] * wide.unsqueeze(-2)).sum(-1) + matrix[..., 2]
-        dtype = torch.promote_types(pixels.dtype, torch.float32)
-        moved = torch.where(valid.unsqueeze(-1), moved, -1.0).to(dtype)
-        return moved, valid & self.target.contains(moved) if on_image else valid
+        return placed(self.target, moved.to(torch.promote_types(pixels.dtype, torch.float32)), valid, on_image)
 
 
 def _resized(images: Tensor, size: Sequence[int], mode: str = "bilinear", flips: tuple[int, ...] = ()) -> Tensor:

@@ -34,6 +34,10 @@ def moved_pixels(
             return moved.view(pixels.shape), valid.view(pixels.shape[:-1])
     rays, has_ray = start.unproject(pixels)
     moved, mapped = end.project(turn(rotation, rays, "pixels"))
-    valid = mapped & has_ray
-    moved = torch.where(valid.unsqueeze(-1), moved, -1.0)
-    return moved, valid & end.contains(moved) if on_image else valid
+    return placed(end, moved, mapped & has_ray, on_image)
+
+
+def placed(camera: Camera, pixels: Tensor, valid: Tensor, on_image: bool) -> tuple[Tensor, Tensor]:
+    """Return pixels, (-1, -1) for those not valid, and which are valid: if `on_image`, those on the camera's image."""
+    pixels = torch.where(valid.unsqueeze(-1), pixels, -1.0)
+    return pixels, valid & camera.contains(pixels) if on_image else valid

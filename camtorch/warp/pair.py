@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -36,14 +35,13 @@ def _part(held: str, name: str) -> Any:
 class Plan:
     """The positions of a warp while its cameras stay, or once and for all, and calls that are ready for some images."""
 
-    def __init__(self, positions: dict[str, Sampling | Lattice], is_pinned: bool = False):
-        """Keep positions by the padding that they serve; is_pinned: whether they stay if the cameras change."""
-        self.is_pinned, self.positions, self.calls = is_pinned, Kept(6), Kept(8)
+    def __init__(self, pinned: Sampling | Lattice | None = None, padding: str = "zeros"):
+        """Keep positions by the padding that they serve; `pinned` ones stay if the cameras change."""
+        self.is_pinned, self.positions, self.calls = pinned is not None, Kept(6), Kept(8)
         self._exact: Sampling | None = None
-        for padding in positions:
-            self.positions_for(padding, partial(positions.__getitem__, padding))
-        exact = self.positions.result
-        self._exact = exact if is_pinned and isinstance(exact, Sampling) else None
+        if pinned is not None:
+            self.positions_for(padding, lambda: pinned)
+            self._exact = pinned if isinstance(pinned, Sampling) else None
 
     def positions_for(self, padding: str, compute: Callable[[], Sampling | Lattice]) -> Sampling | Lattice:
         """Return `compute()` without a graph, or what is kept; pinned positions that are exact serve all paddings."""

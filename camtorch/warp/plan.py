@@ -172,13 +172,12 @@ def positions(warp: CameraPair, route: Route, padding: PaddingMode = "zeros") ->
         return constant
     reach = _reach(warp, padding)
     key = reach if warp.tolerance else "zeros"
-    plan = _plan_of(warp, lambda: Plan({key: _computed(warp, reach)}))
-    return plan.positions_for(key, lambda: _computed(warp, reach))
+    return _plan_of(warp).positions_for(key, lambda: _computed(warp, reach))
 
 
-def _plan_of(warp: CameraPair, make: Callable[[], Plan]) -> Plan:
+def _plan_of(warp: CameraPair) -> Plan:
     pinned: Plan = warp._kept.result
-    return pinned if warp.is_pinned else warp._kept(warp._inputs(), warp._options, make)
+    return pinned if warp.is_pinned else warp._kept(warp._inputs(), warp._options, Plan)
 
 
 def by_pixel(warp: CameraPair) -> Sampling:
@@ -241,7 +240,7 @@ def pin(warp: CameraPair) -> None:
         where = positions(warp, "graph")
     else:
         where = positions(warp, "kept") if is_exporting() else _computed(warp, warp.padding_mode)
-    warp._kept.renew(lambda: Plan({warp.padding_mode: where}, is_pinned=True))
+    warp._kept.renew(lambda: Plan(where, warp.padding_mode))
 
 
 def _reach(warp: CameraPair, padding: PaddingMode) -> PaddingMode:
@@ -276,7 +275,7 @@ def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | Lattice | No
             grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
             return where._replace(grid=grid, mapped=mapped)
 
-        plan = _plan_of(warp, lambda: Plan({}))
+        plan = _plan_of(warp)
         return own() if plan.is_pinned else plan.positions_for(f"constant {_reach(warp, padding)}", own)
 
 

@@ -11,6 +11,7 @@ from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotate_planes, rotation_matrix
 from camtorch.values.arguments import Numbers, as_batch, as_coordinates, check_devices
 from camtorch.warp.grid import Sampling, pixels_of_rows, scaled_rows, to_positions
+from camtorch.warp.moving import placed
 from camtorch.warp.panorama import off_poles
 from camtorch.warp.sampling import PaddingMode, WarpOptions
 from camtorch.warp.warp import Warp
@@ -62,12 +63,9 @@ class ProxyWarp(Warp):
         near, meets = self._nearness(rays, of_source=not back)
         directions = turned(rotation, rays) + beside(shift, rays) * near[..., None]
         seen, mapped = target.project(off_poles(target, directions))
-        valid = mapped & has_ray & meets
-        seen = torch.where(valid.unsqueeze(-1), seen, -1.0)
-        return seen, valid & target.contains(seen) if on_image else valid
+        return placed(target, seen, mapped & has_ray & meets, on_image)
 
     def transform_rays(self, rays: Numbers) -> Tensor:
-        """Turn directions (B, *N, 3), or (*N, 3), from the source's to the target's frame; lengths stay."""
         rays = as_coordinates(rays, "rays", 3, type(self).__name__, self.source.intrinsics.device, "B, *N")
         return turned(self._pose()[0].mT.to(rays.dtype), rays)
 

@@ -142,7 +142,8 @@ class Reproject(GeometryModule):
 
     def _seen(self, depth: Tensor, kind: str) -> tuple[Tensor, Tensor, Tensor]:
         """Return source pixels (B, D, H', W', 2), whether they are valid, and the depth at which they are seen."""
-        rays, has_ray = self._rays()
+        target = self.target
+        rays, has_ray = self._memo.unless_learning(target._tensors, target._form, target.rays)
         if rays.ndim == 3:
             rays, has_ray = rays[None], has_ray[None]
         scale, good = depth_scale(depth, rays[:, None], has_ray[:, None], kind)
@@ -160,13 +161,6 @@ class Reproject(GeometryModule):
         off = near - pixels.detach()
         off = torch.where(off.abs() <= _SNAP.get(pixels.dtype, 0.0), off, 0.0)
         return pixels + off, mapped & good, far
-
-    def _rays(self) -> tuple[Tensor, Tensor]:
-        """Return the target's rays and their validity, kept while nothing can learn."""
-        inputs = self.target._tensors
-        if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-            return self.target.rays()
-        return self._memo(inputs, self.target._form, self.target.rays)
 
     def _shows(
         self, seen: Tensor, far: Tensor, source_depth: Numbers, kind: str, tolerance: float, owner: str

@@ -12,6 +12,7 @@ from torch.nn.functional import max_pool2d
 from camtorch.cameras.camera import Camera
 from camtorch.rays.depth import as_depth, depth_scale
 from camtorch.warp.grid import Sampling, to_positions
+from camtorch.warp.moving import placed
 from camtorch.warp.sampling import PaddingMode
 from camtorch.warp.warp import Warp
 
@@ -93,9 +94,7 @@ class ShiftedWarp(Warp):
         rays, has_ray = self.source.unproject(pixels)
         length = _between(self.distance.to(rays), pixels.detach())
         moved, mapped = self.target.project(self.transform_positions(rays * length[..., None]))
-        valid = has_ray & mapped & (length > 0)
-        moved = torch.where(valid[..., None], moved, -1.0)
-        return moved, valid & self.target.contains(moved) if on_image else valid
+        return placed(self.target, moved, has_ray & mapped & (length > 0), on_image)
 
     @torch.no_grad()
     def _surface(self) -> tuple[Tensor, Tensor]:

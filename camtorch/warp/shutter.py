@@ -132,7 +132,6 @@ class RollingShutter(GeometryModule):
         super().__setstate__(state)  # type: ignore[no-untyped-call]
 
     def extra_repr(self) -> str:
-        """Return the readout, the rates and the direction."""
         readout, rates = map(values_of, (self.readout, self.rates))
         if self.batch_shape or readout is None or rates is None:
             return f"batch_shape={tuple(self.batch_shape)}, direction={self.direction!r}"
@@ -219,19 +218,18 @@ class ShutterWarp(MirrorWarp):
 
     def detach(self) -> Warp:
         rotation = None if self.rotation is None else self.rotation.detach()
-        options = {**self.options, **self._shutters(RollingShutter.detach)}
-        return self.between(self.source.detach(), self.target.detach(), rotation, **options)
+        return self._with(RollingShutter.detach, self.source.detach(), self.target.detach(), rotation)
 
     def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
-        shutters = self._shutters(lambda shutter: shutter.rows_of(index))
-        return self.between(source, target, rotation, **self.options, **shutters)
+        return self._with(lambda shutter: shutter.rows_of(index), source, target, rotation)
 
     def follow(self, first: Warp) -> Warp:
         return self.between(first.source, first.target, first.rotation, **self.options)
 
-    def _shutters(self, change: Callable[[RollingShutter], RollingShutter]) -> dict[str, RollingShutter | None]:
+    def _with(self, change: Callable[[RollingShutter], RollingShutter], *between: Any) -> Warp:
         both = {"shutter": self.shutter, "target_shutter": self.target_shutter}
-        return {name: None if each is None else change(each) for name, each in both.items()}
+        shutters: Any = {name: None if each is None else change(each) for name, each in both.items()}
+        return self.between(*between, **self.options, **shutters)
 
 
 def _behind(shutter: RollingShutter | None, camera: Camera) -> Camera:
