@@ -538,7 +538,6 @@ class Camera(Freezable, Editable):
         return as_html(self)
 
     def extra_repr(self) -> str:
-        """Return the batch, the size and, for a single camera, its numbers as text."""
         return described(self)
 
 

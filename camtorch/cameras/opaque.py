@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.recorded import CLASSES
+from camtorch.evaluate.recorded import CLASSES, Registry
 from camtorch.values.module import remade
 
 Function = Callable[..., tuple[Tensor, ...]]
@@ -40,7 +39,7 @@ class CameraNumbers(NamedTuple):
     image_size: tuple[int, int]
 
 
-_FUNCTIONS: dict[str, tuple[Function, Function]] = {}
+_FUNCTIONS = Registry()  # each function with its `shapes`
 
 
 def opaque(shapes: Function) -> Callable[[Function], Function]:
@@ -85,12 +84,6 @@ def opaque(shapes: Function) -> Callable[[Function], Function]:
     return decorate
 
 
-def _function(name: str) -> tuple[Function, Function]:
-    if name not in _FUNCTIONS:  # a saved program may be loaded before its functions
-        importlib.import_module(name.rpartition(".")[0])
-    return _FUNCTIONS[name]
-
-
 def _arguments(
     kinds: str, tensors: Sequence[Tensor], sizes: Sequence[int], floats: Sequence[float], camera: Callable[..., Any]
 ) -> list[Any]:
@@ -114,13 +107,13 @@ def _arguments(
 def _computed(
     name: str, kinds: str, tensors: Sequence[Tensor], sizes: Sequence[int], floats: Sequence[float]
 ) -> list[Tensor]:
-    return list(_function(name)[0](*_arguments(kinds, tensors, sizes, floats, fixed_camera)))
+    return list(_FUNCTIONS[name][0](*_arguments(kinds, tensors, sizes, floats, fixed_camera)))
 
 
 @_computed.register_fake
 def _(name: str, kinds: str, tensors: Sequence[Tensor], sizes: Sequence[int], floats: Sequence[float]) -> list[Tensor]:
     arguments = _arguments(kinds, tensors, sizes, floats, lambda _, *numbers: CameraNumbers(*numbers))
-    return list(_function(name)[1](*arguments))
+    return list(_FUNCTIONS[name][1](*arguments))
 
 
 @_computed.register_vmap

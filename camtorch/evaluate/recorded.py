@@ -92,15 +92,17 @@ def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:
     return function(*inputs)
 
 
-class _Classes(dict[str, Any]):
+class Registry(dict[str, Any]):
+    """What saved programs name: an unknown name imports its module, as a program may be loaded before."""
+
     def __missing__(self, name: str) -> Any:
-        importlib.import_module(name.rpartition(".")[0])  # a saved program may be loaded before its classes
+        importlib.import_module(name.rpartition(".")[0])
         if name not in self:
             raise KeyError(name)
         return self[name]
 
 
-CLASSES = _Classes()
+CLASSES = Registry()
 """All classes of cameras and of radial factors, by name."""
 
 

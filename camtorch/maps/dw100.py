@@ -33,7 +33,6 @@ class DW100(Table):
     steps: tuple[int, ...] = (16,)
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        """Return the file of a mesh and no facts; raise a CameraFileError if a size or position is not supported."""
         for what, size in (("source", exact.source_size), ("target", exact.target_size)):
             if any(not low <= side <= high for low, side, high in zip(_SMALLEST, size, _LARGEST, strict=True)):
                 reason = f"must be 176x144 to 4096x3072 pixels for the DW100; got {size[1]}x{size[0]}"

@@ -44,7 +44,6 @@ class ONNX(MapFormat):
         return _model(exact, dtype).SerializeToString(), {"dtype": dtype, "opset": _OPSET}
 
     def decode(self, content: bytes, described: Mapping[str, Any]) -> LookupMap:
-        """Read a model, as this module writes it; see `MapFormat`."""
         onnx = imported(*_NEEDED)
         graph = onnx.load_model_from_string(content).graph
         (grid,) = (onnx.numpy_helper.to_array(t).astype(np.float64) for t in graph.initializer if t.name == "grid")

@@ -41,7 +41,6 @@ class TILDC(Table):
     steps: tuple[int, ...] = tuple(1 << m for m in range(8))
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        """Return the file of a mesh and its facts; raise a CameraFileError if the LDC does not support them."""
         if max(*exact.source_size, *exact.target_size) > _LARGEST:
             raise CameraFileError(path, "size", f"sides must be at most {_LARGEST} px for the LDC; got more")
         (n, m), places = mesh.nodes.shape[:2], mesh.places

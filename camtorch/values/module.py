@@ -27,13 +27,12 @@ def typed_as(forward: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable
 
 
 _BARE = nn.Module().__dict__
-_CONTAINERS = {"_own": {}, **{name: value for name, value in _BARE.items() if isinstance(value, (dict, set))}}
-_KINDS = [type(value) for value in _CONTAINERS.values()]
+_KINDS = {"_own": dict, **{name: type(value) for name, value in _BARE.items() if isinstance(value, (dict, set))}}
 
 
-def _containers() -> Iterator[tuple[str, Any]]:
-    """Return the names and the empty dicts and sets of a new module."""
-    return zip(_CONTAINERS, [kind() for kind in _KINDS], strict=True)
+def _containers() -> dict[str, Any]:
+    """Return the empty dicts and sets of a new module."""
+    return {name: kind() for name, kind in _KINDS.items()}
 
 
 class UnsharedState(nn.Module):

@@ -159,7 +159,6 @@ class BirdsEye(PlaneWarp):
         self.x, self.y, self.resolution = x, y, resolution
 
     def _check(self, owner: str) -> None:
-        """Raise a ValueError if the camera is not above the ground."""
         place = self.extrinsics.position.detach()
         if known_false(place[..., 2] > 0):
             raise ValueError(
