@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.sending import stacked, within_message
+from camtorch.evaluate.door import COLLATE_FUNCTIONS, collate_by
 from camtorch.evaluate.known import in_worker
-from camtorch.evaluate.private import collate as collate_by
-from camtorch.evaluate.private import collate_functions
 from camtorch.values.arguments import is_list
 
 
@@ -36,8 +35,8 @@ def collate(samples: Sequence[object]) -> object:
         raise TypeError(f"collate: samples must be a list of samples; got {type(samples).__name__}")
     if not samples:
         raise ValueError("collate: samples must not be empty; got an empty list")
-    others = {kind: functools.partial(_others, function) for kind, function in collate_functions().items()}
-    return collate_by(samples, {**others, Tensor: _tensors, np.ndarray: _arrays})
+    others = {kind: functools.partial(_others, function) for kind, function in COLLATE_FUNCTIONS.items()}
+    return collate_by(samples, collate_fn_map={**others, Tensor: _tensors, np.ndarray: _arrays})
 
 
 def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:
@@ -46,7 +45,7 @@ def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor |
     if len({tensor.shape for tensor in batch}) > 1:
         return list(batch)
     sent = stacked(batch)
-    return collate_functions()[Tensor](batch, collate_fn_map=collate_fn_map) if sent is None else sent
+    return COLLATE_FUNCTIONS[Tensor](batch, collate_fn_map=collate_fn_map) if sent is None else sent
 
 
 def _arrays(batch: Sequence[np.ndarray], *, collate_fn_map: Any = None) -> Tensor | list[Tensor]:

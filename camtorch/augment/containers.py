@@ -28,7 +28,7 @@ from camtorch.augment.kinds import OWN, is_text, kind_of
 from camtorch.augment.sample import KeepsCamera, Sample, Single, detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import collate_cameras
-from camtorch.evaluate.private import pytree
+from camtorch.evaluate.door import pytree
 from camtorch.values.arguments import as_values, check_boxes, shown
 from camtorch.values.module import remade
 

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from camtorch.augment.change import Change, Drawn
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.door import pytree
 from camtorch.evaluate.known import are_free, are_numbers, known_false, known_true
-from camtorch.evaluate.private import pytree
 from camtorch.poses.rotations import are_rotations, check_rotation, is_right, rotation_matrix, rotation_vector
 from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians, warn
 from camtorch.values.threads import thread_count

@@ -42,9 +42,9 @@ from camtorch.augment.kinds import (
 )
 from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free, in_worker, is_unknown
-from camtorch.evaluate.private import pytree
 from camtorch.models import Pinhole
 from camtorch.values.arguments import (
     CLOSE,

@@ -22,7 +22,7 @@ from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_e
 from camtorch.augment.kinds import IMAGES, KEEP, KINDS, OWN, as_tensor, kind_of, pattern_of
 from camtorch.augment.sample import Frames, detached, on_samples
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.private import pytree
+from camtorch.evaluate.door import pytree
 from camtorch.warp.arrays import as_planes_of
 from camtorch.warp.boxes import lattice_of, turned
 

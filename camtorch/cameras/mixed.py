@@ -16,9 +16,9 @@ from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.numbers import as_numbers_of
+from camtorch.evaluate.door import COLLATE_FUNCTIONS
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import in_worker
-from camtorch.evaluate.private import collate_functions
 from camtorch.projection.evaluation import kept_cameras, per_row
 from camtorch.projection.evaluation import rows_of as camera_rows
 from camtorch.values.arguments import Numbers, as_image_size, as_points, no_camera, shown, working_dtype
@@ -414,4 +414,4 @@ def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> C
 
 
 # Samples that hold cameras then go through a DataLoader as they are. torch documents this map for the purpose.
-collate_functions()[Camera] = collate_cameras
+COLLATE_FUNCTIONS[Camera] = collate_cameras

@@ -5,15 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import NoneType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
+from torch.utils import _pytree
 from torch.utils._python_dispatch import _disable_current_modes
+from torch.utils.data._utils.collate import collate, default_collate_fn_map
 
 FAKE_MODE = torch._C._TorchDispatchModeKey.FAKE
 """The key of a FakeTensorMode among the active modes."""
+NO_TORCH_FUNCTION: Any = torch._C._disabled_torch_function_impl
+"""The `__torch_function__` of a class of tensors whose operators return plain tensors."""
+pytree = _pytree
+"""Trees, with the paths of their leaves."""
+TORCH_LIBRARY: str = torch._C.__file__
+"""The shared library of torch, which has the functions of OpenMP and MKL that it uses."""
+COLLATE_FUNCTIONS: dict[Any, Callable[..., Any]] = default_collate_fn_map
+"""The functions of `default_collate` by the types of their parts; it uses those that are added."""
+collate_by: Callable[..., Any] = collate
+"""`default_collate` with other functions, `collate_fn_map`."""
 
 _DENSE = torch._C._dispatch_keys(torch.empty(0, device="cpu"))
 _PLAIN: int = _DENSE.raw_repr()
@@ -218,3 +230,11 @@ def way_of(module: nn.Module, values: Tensor, *parameters: Tensor) -> Way:
 def is_native(values: Tensor) -> bool:
     """Whether compiled code may read values, in a call without tracing or transforms."""
     return in_memory(values) and not is_recorded()
+
+
+def while_loop(condition: Callable[..., Any], body: Callable[..., Any], state: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return the state after a loop, which is recorded as one."""
+    # torch does not import it at first
+    from torch._higher_order_ops.while_loop import while_loop as loop
+
+    return cast("tuple[Any, ...]", loop(condition, body, state))

@@ -11,8 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from camtorch.evaluate.door import keeps_graph, set_aside
-from camtorch.evaluate.private import while_loop
+from camtorch.evaluate.door import keeps_graph, set_aside, while_loop
 
 _recording = False
 

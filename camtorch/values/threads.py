@@ -15,8 +15,7 @@ from typing import ParamSpec, TypeVar
 
 import torch
 
-from camtorch.evaluate.door import in_jit_trace
-from camtorch.evaluate.private import TORCH_LIBRARY
+from camtorch.evaluate.door import TORCH_LIBRARY, in_jit_trace
 
 P = ParamSpec("P")
 R = TypeVar("R")

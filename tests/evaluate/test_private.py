@@ -10,7 +10,7 @@ from torch.autograd import forward_ad
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from camtorch.evaluate import door, private
+from camtorch.evaluate import door
 from camtorch.evaluate.kept import note, same
 
 # newer ones warn of what they still do
@@ -83,18 +83,18 @@ def test_what_is_set_aside_is_not_recorded():
 
 def test_other_parts():
     class Tagged(torch.Tensor):
-        __torch_function__ = private.NO_TORCH_FUNCTION
+        __torch_function__ = door.NO_TORCH_FUNCTION
 
     assert type(torch.ones(2).as_subclass(Tagged) + 1) is torch.Tensor
     if sys.platform == "linux":
-        assert hasattr(ctypes.CDLL(private.TORCH_LIBRARY), "omp_set_num_threads")
-    paths, _ = private.pytree.tree_flatten_with_path({"a": [1, 2]})
-    assert [private.pytree.keystr(path) for path, _ in paths] == ["['a'][0]", "['a'][1]"]
-    assert torch.Tensor in private.collate_functions()
-    batch = private.collate([{"a": 1}, {"a": 2}], {**private.collate_functions(), int: lambda b, **_: sum(b)})
+        assert hasattr(ctypes.CDLL(door.TORCH_LIBRARY), "omp_set_num_threads")
+    paths, _ = door.pytree.tree_flatten_with_path({"a": [1, 2]})
+    assert [door.pytree.keystr(path) for path, _ in paths] == ["['a'][0]", "['a'][1]"]
+    assert torch.Tensor in door.COLLATE_FUNCTIONS
+    batch = door.collate_by([{"a": 1}, {"a": 2}], collate_fn_map={**door.COLLATE_FUNCTIONS, int: lambda b, **_: sum(b)})
     assert batch == {"a": 3}
     start = torch.tensor(0), torch.tensor(0)
-    count, total = private.while_loop(lambda n, t: n < 4, lambda n, t: (n + 1, t + n), start)
+    count, total = door.while_loop(lambda n, t: n < 4, lambda n, t: (n + 1, t + n), start)
     assert (int(count), int(total)) == (4, 6)
 
 
