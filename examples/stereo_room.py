@@ -70,7 +70,8 @@ def study(
     """Rectify to a projection of (horizontal, vertical) degrees, match, and compare."""
     pair = ct.rectify(lens, lens, pose, projection=projection, fov=fov)  # type: ignore[arg-type]
     first, second = (image[0] for image in pair(left, right))
-    disparity = match(first, second, *pair.disparity_range(near=0.45))
+    most = float(pair.camera_left.fx * pair.baseline / 0.45)  # of points at least 45 cm away
+    disparity = match(first, second, *sorted((0.0, most)))
     points, good = pair.disparity_to_points(disparity, pair.left.valid_mask()[0, 0])
 
     room_from_rectified = LEFT.T @ pair.rotation_left.T

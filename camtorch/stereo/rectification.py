@@ -162,36 +162,12 @@ class Rectification(GeometryModule):
         step = torch.where(good, d, 1.0).double()[..., None] * _unit(self._axis, pixels.double())[:2]
         (left, one), (right, other) = camera.unproject(pixels.double()), camera.unproject(pixels - step)
         # both rays in their plane, along the baseline and away from it
-        (a, b), (c, e) = ((rays[..., self._axis], self._distance(rays)) for rays in (left, right))
+        across = 1 - self._axis
+        (a, b), (c, e) = ((t[..., self._axis], torch.hypot(t[..., across], t[..., 2])) for t in (left, right))
         sine = a * e - b * c
         good = good & one & other & (sine * baseline > 0)
         scale = torch.where(good, baseline * e / torch.where(good, sine, 1.0), 0.0)
         return (left * scale[..., None]).to(d.dtype), good & (scale > 0) & torch.isfinite(scale)
-
-    def _distance(self, points: Tensor) -> Tensor:
-        """Return the distance of points (..., 3) from the baseline."""
-        return torch.hypot(points[..., 1 - self._axis], points[..., 2])
-
-    @torch.no_grad()
-    def disparity_range(self, near: float, far: float = math.inf) -> tuple[float, float]:
-        """Return the least and the greatest disparity of points in a range of depths, over all pixels and pairs.
-
-        Args:
-            near: The least depth: z in perspective, the distance from the baseline in panoramas.
-            far: The greatest depth.
-        """
-        if not 0 < near < far:
-            raise ValueError(f"disparity_range: depths must be 0 < near < far; got near={near}, far={far}")
-        rays, has_ray = self.camera_left.rays()
-        rays = rays / (rays[..., 2] if self.projection == "perspective" else self._distance(rays))[..., None]
-        shift = self.baseline[..., None, None, None] * _unit(self._axis, self.baseline)
-        found = [rays.new_zeros(1)] if math.isinf(far) else []
-        for depth in (near, far)[: 2 - len(found)]:
-            seen, valid = self.camera_right.project((depth * rays - shift).to(rays.dtype))
-            disparity = (self.camera_left.pixel_grid() - seen)[..., self._axis]
-            found.append(disparity[valid & has_ray])
-        least, most = torch.cat(found).aminmax()
-        return float(least), float(most)
 
     def opencv(self) -> dict[str, Tensor]:
         """Return R1, R2, P1, P2 and Q, as `cv2.stereoRectify` does, for a perspective pair without batch.

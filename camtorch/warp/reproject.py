@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d, pad
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
@@ -14,7 +13,7 @@ from camtorch.evaluate.known import are_plain, known_true
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix
 from camtorch.rays.depth import as_depth, depth_scale
-from camtorch.values.arguments import Numbers, as_number, check_devices, one_of, shown
+from camtorch.values.arguments import Numbers, check_devices, one_of, shown
 from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.panorama import off_poles, seam_of
@@ -79,15 +78,7 @@ class Reproject(GeometryModule):
         self._memo = Kept()
         seam_of(source)  # keep it while values can be read: traced code needs it too
 
-    def forward(
-        self,
-        images: Tensor,
-        depth: Numbers,
-        kind: str = "z",
-        *,
-        source_depth: Numbers | None = None,
-        tolerance: float = 0.02,
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, images: Tensor, depth: Numbers, kind: str = "z") -> tuple[Tensor, Tensor]:
         """Return the target's images and the mask of valid pixels.
 
         Args:
@@ -95,9 +86,6 @@ class Reproject(GeometryModule):
             depth: (B, 1, H', W') of the target, or (B, D, H', W') for D depths to try at each pixel: planes of one
                 depth each are `torch.linspace(near, far, D).view(1, D, 1, 1).expand(1, D, H', W')`.
             kind: the kind of depth: "z" along the optical axis, or "distance" from the camera.
-            source_depth: (B, 1, H, W) of the source, of the same kind; pixels that something hides from the source are
-                then not valid.
-            tolerance: the part of the source's depth by which a point may lie behind it.
 
         Returns:
             images (B, C, H', W'), and valid (B, 1, H', W') bool: the depth is valid, see `Camera.backproject`, and the
@@ -117,9 +105,7 @@ class Reproject(GeometryModule):
         count = max(counts.values())
         if any(n not in (1, count) for n in counts.values()):
             raise ValueError(f"{owner}: batch sizes must be 1 or equal; got {counts}")
-        seen, valid, far = self._seen(given, kind)
-        if source_depth is not None:
-            valid = valid & self._shows(seen, far, source_depth, kind, as_number(tolerance, "tolerance", owner), owner)
+        seen, valid = self._seen(given, kind)
         rows, steps = seen.shape[0], seen.shape[1]
         # an image that is shifted by whole pixels, or not at all, is copied to the bit
         plain = steps == 1 and are_plain(seen) and known_true((seen == seen.round()).all(-1) | ~valid)
@@ -140,8 +126,8 @@ class Reproject(GeometryModule):
         @typed_as(forward)
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
-    def _seen(self, depth: Tensor, kind: str) -> tuple[Tensor, Tensor, Tensor]:
-        """Return source pixels (B, D, H', W', 2), whether they are valid, and the depth at which they are seen."""
+    def _seen(self, depth: Tensor, kind: str) -> tuple[Tensor, Tensor]:
+        """Return source pixels (B, D, H', W', 2), and whether they are valid."""
         target = self.target
         rays, has_ray = self._memo.unless_learning(target._tensors, target._form, target.rays)
         if rays.ndim == 3:
@@ -155,28 +141,11 @@ class Reproject(GeometryModule):
         if self.source.batch_shape and len(points) != len(self.source.intrinsics):
             points = points.expand(len(self.source.intrinsics), *points.shape[1:])
         pixels, mapped = self.source.project(off_poles(self.source, points))
-        far = points[..., 2] if kind == "z" else torch.linalg.vector_norm(points.detach(), dim=-1)
         # pixels that rounding moved off a pixel's centre are moved back, with their gradient
         near = pixels.detach().round()
         off = near - pixels.detach()
         off = torch.where(off.abs() <= _SNAP.get(pixels.dtype, 0.0), off, 0.0)
-        return pixels + off, mapped & good, far
-
-    def _shows(
-        self, seen: Tensor, far: Tensor, source_depth: Numbers, kind: str, tolerance: float, owner: str
-    ) -> Tensor:
-        """Whether the source's depth lets it see points at its pixels."""
-        size = self.source._size_for(owner)
-        given = as_depth(source_depth, kind, size, f"{owner}: source_depth", seen.device).detach()
-        given = (given if given.ndim == 4 else given[None, None])[:, :1]
-        known = torch.isfinite(given) & (given > 0)
-        # the farthest of the four pixels around: the rim of a foreground then hides nothing that is seen behind it
-        around = max_pool2d(pad(torch.where(known, given, torch.inf), (1, 1, 1, 1), mode="replicate"), 2, 1)
-        planes = zip(seen.detach().unbind(-1), size[::-1], strict=True)
-        u, v = ((plane.floor() + 1).long().clamp(0, side) for plane, side in planes)
-        rows = around.flatten(1).expand(len(seen), -1)
-        furthest = rows.gather(1, (v * (size[1] + 1) + u).flatten(1)).view(seen.shape[:-1])
-        return far.detach() <= furthest * (1 + tolerance)
+        return pixels + off, mapped & good
 
     def extra_repr(self) -> str:
         return f"mode={self.mode!r}, padding_mode={self.padding_mode!r}, fill={self.fill!r}"

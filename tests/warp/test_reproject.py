@@ -81,24 +81,6 @@ def test_a_sweep_is_its_planes_one_by_one():
         assert torch.equal(valid[:, :, i], here)
 
 
-def test_what_stands_behind_something_is_not_seen():
-    camera = ct.Pinhole([40.0, 40, 31.5, 23.5], image_size=(48, 64)).requires_grad_(False)
-    beside = ct.Extrinsics([0.0, 0, 0], [-0.5, 0, 0]).requires_grad_(False)
-    depth = torch.full((1, 1, 48, 64), 4.0)
-    depth[..., 16:32, 28:36] = 1.0  # hides what is behind it
-    of_source = torch.full((1, 1, 48, 64), 4.0)
-    of_source[..., 16:32, 8:16] = 1.0  # 20 px to the left, where the wall moves by 5
-    images = torch.rand(1, 1, 48, 64)
-    _, anything = ct.Reproject(camera, camera, beside)(images, depth)
-    _, seen = ct.Reproject(camera, camera, beside)(images, depth, source_depth=of_source)
-    hidden = (anything & ~seen)[0, 0]
-    expected = torch.zeros(48, 64, dtype=torch.bool)
-    expected[16:32, 13:21] = True
-    assert (hidden & ~expected).sum() == 0
-    assert hidden.sum() > 0.7 * expected.sum()  # between two depths the farther one counts
-    assert seen[0, 0, 20, 30]
-
-
 @pytest.mark.parametrize("kind", ["z", "distance"])
 def test_backprojected_points_are_seen_at_their_pixels(kind):
     camera = fisheye()
