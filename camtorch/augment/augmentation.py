@@ -496,7 +496,6 @@ class Augmentation(SampleTransform):
         return {**self.__dict__, "_last": None}
 
     def extra_repr(self) -> str:
-        """Show the ranges and the options."""
         parts = [f"{name}={interval}" for name, interval in self.ranges.items()]
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])

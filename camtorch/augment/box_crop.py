@@ -62,7 +62,7 @@ class BoxCrop(Augmentation):
         ranges = {n: as_range(v, n, name, least=-180, most=180) for n, v in turns.items() if v is not None}
         if zoom is not None:
             ranges["zoom"] = as_range(zoom, "zoom", name, around=1, least=1e-3, most=1e3)
-        super().__init__(ranges, **options)
+        super().__init__(ranges, min_filled=0, **options)  # a box at the rim of the image is intended
         self.image_size, self.margin = as_known_size(image_size, name), as_margin(margin, name)
         self.crops = {"box": as_whole(index, "index", name)}
 
@@ -71,8 +71,8 @@ class BoxCrop(Augmentation):
         box = values["box"]
         rows = box.reshape(-1, 4)
         check_extents(rows, source, self._name)
-        intrinsics, rotation = looking_at(source, rows, self.image_size, self.margin, self._name)
-        intrinsics, rotation = (t[0] if box.ndim == 1 else t for t in (intrinsics, rotation))
+        found = looking_at(source, rows, self.image_size, self.margin, self._name)
+        intrinsics, rotation = (t[0] if box.ndim == 1 else t for t in found)
         if "zoom" in values:
             zoom = values["zoom"].double()
             one = torch.ones_like(zoom)
@@ -82,10 +82,6 @@ class BoxCrop(Augmentation):
             rotation = mount_rotation(*(values.get(n, nothing).double() for n in ("yaw", "pitch", "roll"))) @ rotation
         return pinhole(intrinsics.to(box), self.image_size), rotation.to(box)
 
-    def tell_of_empty_images(self, camera: Camera) -> None:
-        """Do not warn: a box at the rim of the image is intended."""
-
     def extra_repr(self) -> str:
-        """Return image_size, margin and index, then the ranges and the options."""
         own = f"image_size={self.image_size}, margin={self.margin:g}, index={self.crops['box']}"
         return f"{own}, {super().extra_repr()}"

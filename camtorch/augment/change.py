@@ -14,7 +14,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.known import are_numbers, known_false, known_true
-from camtorch.poses.rotations import turn
+from camtorch.poses.rotations import is_right, turn
 from camtorch.projection.evaluation import rows_of
 from camtorch.projection.native_cameras import Native
 from camtorch.values.dtypes import narrow, widen
@@ -36,7 +36,8 @@ def _same(value: Tensor) -> Tensor:
     return value
 
 
-def _as_is(camera: Camera, rows: Tensor) -> Tensor:
+def as_is(camera: Camera, rows: Tensor) -> Tensor:
+    """Return values of samples that nothing moves."""
     return rows
 
 
@@ -65,7 +66,6 @@ class Drawn:
         return self.camera()
 
     def camera(self) -> Camera:
-        """Return a new module."""
         if torch.is_inference_mode_enabled():  # what that makes could not be used in a graph later
             with torch.inference_mode(False), torch.no_grad():
                 return self.camera()
@@ -74,7 +74,6 @@ class Drawn:
         return remade(self.base, intrinsics=numbers, distortion=k, image_size=self.image_size)
 
     def warp(self, source: Camera) -> Warp:
-        """Return the warp from the camera before."""
         if self.made is None:
             self.made = MirrorWarp(source, self.target, self.rotation, **self.options)
         return self.made
@@ -98,7 +97,6 @@ class Part:
 
     @property
     def target(self) -> Camera:
-        """After the change."""
         return self.camera if self.moves is None else self.moves.target
 
     @property
@@ -161,7 +159,8 @@ def _joined(a: Part, b: Part) -> Part:
             )
         if isinstance(b.moves, Drawn) and not a.camera.batch_shape:
             start = a.moves.start if isinstance(a.moves, Drawn) else _single(a.camera)
-            moves = replace(b.moves, rotation=rotation, start=start, is_turn=rotation is None or _is_proper(rotation))
+            is_turn = rotation is None or (rotation.ndim == 2 and is_right(rotation))
+            moves = replace(b.moves, rotation=rotation, start=start, is_turn=is_turn)
             return replace(b, rows=a.rows, camera=a.camera, moves=moves)
         moved = b.by(lambda warp: MirrorWarp(a.camera, warp.target, rotation))
         return replace(moved, rows=a.rows, camera=a.camera)
@@ -352,7 +351,7 @@ class Change:
         return self._inverse
 
     def each(
-        self, value: Tensor, move: Callable[[Part, Tensor], Moved], stay: Callable[[Camera, Tensor], Moved]
+        self, value: Tensor, move: Callable[[Part, Tensor], Moved], stay: Callable[[Camera, Tensor], Any] = as_is
     ) -> Moved:
         """Return `move(part, rows)` of every part's rows of `value`, and `stay(camera, rows)` if nothing moves.
 
@@ -387,7 +386,7 @@ class Change:
                 moved = warp.pin().forward(rows, **options)
             return moved if part.light is None else narrow(widen(moved) * part.light.to(moved.device), rows.dtype)
 
-        return self.each(images, move, _as_is)
+        return self.each(images, move)
 
     def labels(self, masks: Tensor, fill: float = 0.0, mode: Mode = "nearest") -> Tensor:
         """Move masks (count, C, H, W) of any dtype by their nearest values; unseen pixels are `fill`."""
@@ -395,16 +394,14 @@ class Change:
         def move(part: Part, rows: Tensor) -> Tensor:
             return part.warp.pin().forward(rows, mode=mode, padding_mode="zeros", fill=fill)
 
-        return self.each(masks, move, _as_is)
+        return self.each(masks, move)
 
     def valid_mask(self) -> Tensor:
         """Return the pixels at which the images show something, (count, 1, H', W') bool."""
         camera = self.parts[0].camera
         shape = self.count, 1, camera.height, camera.width
         everywhere = torch.ones(shape, dtype=torch.bool, device=camera.intrinsics.device)
-        return self.each(
-            everywhere, lambda part, rows: part.warp.pin().valid_mask().expand(len(rows), -1, -1, -1), _as_is
-        )
+        return self.each(everywhere, lambda part, rows: part.warp.pin().valid_mask().expand(len(rows), -1, -1, -1))
 
     def points(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Move pixels (count, *N, 2), and return valid (count, *N): on the image."""
@@ -455,7 +452,7 @@ class Change:
             still = (rotation == _eye(rotation)).all(-1).all(-1)
             return torch.where(still.reshape(-1, *[1] * (rows.ndim - 1)), rows.to(moved), moved)
 
-        return self.each(rays, move, _as_is)
+        return self.each(rays, move)
 
     def positions(self, points: Tensor) -> Tensor:
         """Move points (count, *N, 3) of the camera frame: they turn, and shift if the camera moves."""
@@ -465,18 +462,11 @@ class Change:
                 return part.moves.transform_positions(rows)
             return rows.clone() if part.rotation is None else turn(part.rotation, rows, "points")
 
-        return self.each(points, move, _as_is)
+        return self.each(points, move)
 
     def distance(self, distance: Tensor) -> Tensor:
         """Move distances from the camera (count, C, H, W); unknown ones are 0."""
-
-        def move(part: Part, rows: Tensor) -> Tensor:
-            warp = part.warp
-            if isinstance(warp, ShiftedWarp):
-                return narrow(warp.moved_distance(widen(rows)), rows.dtype)
-            return warp.pin()(rows, mode="nearest", padding_mode="zeros", fill=0.0)
-
-        return self.each(distance, move, _as_is)
+        return self.each(distance, lambda part, rows: narrow(_distance(part.warp, widen(rows)), rows.dtype))
 
     def depth(self, depth: Tensor) -> Tensor:
         """Move depths along z (count, 1, H, W), positive in front; unknown ones are 0.
@@ -493,16 +483,20 @@ class Change:
         def move(part: Part, rows: Tensor) -> Tensor:
             warp = part.warp
             if isinstance(warp, AffineWarp):
-                return warp.pin()(rows, mode="nearest", padding_mode="zeros", fill=0.0)
+                return _distance(warp, rows)
             wide = widen(rows)
             before, after = (ahead(camera, wide) for camera in (warp.source, warp.target))
             distance = torch.where(before.abs() > 1e-6, wide / before, 0.0)
-            if isinstance(warp, ShiftedWarp):
-                return narrow(warp.moved_distance(distance) * after, rows.dtype)
-            moved = warp.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0) * after
-            return narrow(moved, rows.dtype)
+            return narrow(_distance(warp, distance) * after, rows.dtype)
 
-        return self.each(depth, move, _as_is)
+        return self.each(depth, move)
+
+
+def _distance(warp: Warp, distance: Tensor) -> Tensor:
+    """Return distances (n, C, H, W) from the warp's target; unknown ones are 0."""
+    if isinstance(warp, ShiftedWarp):
+        return warp.moved_distance(distance)
+    return warp.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0)
 
 
 def by_kinds(
@@ -523,14 +517,6 @@ def as_one(camera: Camera | Sequence[Camera]) -> Camera:
 def alone(camera: Camera) -> Camera:
     """Return a batch of one as the camera that it holds, which serves any number of samples."""
     return camera[0] if camera.batch_shape == (1,) else camera
-
-
-def _is_proper(rotation: Tensor) -> bool:
-    """Whether the rotation (3, 3) of a single camera is no mirror; False of several."""
-    if rotation.ndim > 2:
-        return False
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    return bool(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0)
 
 
 def _is_mirror(rotation: Tensor) -> Tensor:

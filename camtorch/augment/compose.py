@@ -156,7 +156,6 @@ class Compose(Augmentation):
         return total.with_options(options)  # type: ignore[arg-type]
 
     def extra_repr(self) -> str:
-        """Return the options."""
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "antialias": self.antialias}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())
 

@@ -359,7 +359,6 @@ class CameraDrawer(Augmentation):
         )
 
     def _size_of(self, source: Camera) -> tuple[int, int]:
-        """Return the (height, width) of the new images."""
         return self.image_size or source.image_size or source._size_for(self._name)
 
     def _base(self, source: Camera, share: Any) -> tuple[Camera, Tensor, Tensor | None]:

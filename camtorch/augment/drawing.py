@@ -72,13 +72,9 @@ class Start:
             rows_of(camera, *[t.expand(*camera.batch_shape, t.shape[-1]) for t in camera._tensors])
             for camera in (source, base)
         )
-        if (
-            before.native is None
-            or cameras.native is None
-            or {t.dtype for t in source._tensors} != {base.intrinsics.dtype}
-        ):
+        if before.native is None or cameras.native is None or before.usable is not None or cameras.usable is not None:
             return None
-        if cameras.usable is not None or before.usable is not None:
+        if {t.dtype for t in source._tensors} != {base.intrinsics.dtype}:
             return None
         return cls(source, before.native, base, cameras.native, *numbers)
 

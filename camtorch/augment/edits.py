@@ -42,7 +42,7 @@ class Edit(Augmentation):
 
     def __init__(self, ranges: Mapping[str, Range] | None = None, **options: Unpack[EditOptions]):
         options.setdefault("antialias", None)
-        super().__init__(ranges, **options)
+        super().__init__(ranges, min_filled=0, **options)  # only pixels that the caller asks for are empty
 
     needs_camera = False
     drawn_on_host = True
@@ -64,17 +64,13 @@ class Edit(Augmentation):
         nothing = {n: torch.full(() if r.size is None else (r.size,), r.low).double() for n, r in self.ranges.items()}
         return self.edit(size, nothing)[1]
 
-    def tell_of_empty_images(self, camera: Camera) -> None:
-        """Do not warn: an edit leaves only pixels empty that the caller asks for."""
-
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         return change_by([(self, draw)], camera, {**self.options, "antialias": self.antialias})
 
     def map_of(self, draw: Mapping[str, Any], size: tuple[int, int]) -> tuple[Map | None, tuple[int, int]]:
         """Return the map of a draw for images of a size (None if it never applies), and the new size."""
         applied = torch.as_tensor(draw["apply"])
-        given = {name: value for name, value in draw.items() if name != "apply"}
-        values = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in given.items()}
+        values = {n: torch.as_tensor(value, dtype=torch.float64) for n, value in draw.items() if n != "apply"}
         matrix, new = self.edit(size, values)
         all_are = known_true(applied) or (self.p == 1 and not known_false(applied))
         if new != size and (not all_are or 0 < self.p < 1):
@@ -91,7 +87,6 @@ class Edit(Augmentation):
         return torch.where(applied[:, None, None].to(matrix.device), matrix, still), new
 
     def extra_repr(self) -> str:
-        """Return the ranges and the options."""
         return super().extra_repr().replace(f"antialias={bool(self.antialias)}", f"antialias={self.antialias}")
 
 

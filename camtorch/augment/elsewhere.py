@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Change, Moved, Part
+from camtorch.augment.change import Change, Moved, Part, as_is
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.door import outside_inference
@@ -62,7 +62,7 @@ class Elsewhere(Change):
         self._wide: Change | None = None
 
     def each(
-        self, value: Tensor, move: Callable[[Part, Tensor], Moved], stay: Callable[[Camera, Tensor], Moved]
+        self, value: Tensor, move: Callable[[Part, Tensor], Moved], stay: Callable[[Camera, Tensor], Any] = as_is
     ) -> Moved:
         own = self.parts[0].camera.intrinsics.dtype
         dtype = torch.promote_types(value.dtype, own) if value.dtype.is_floating_point else own

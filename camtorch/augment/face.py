@@ -183,6 +183,5 @@ class FaceNormalizer(SampleTransform):
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def extra_repr(self) -> str:
-        """Return the numbers of the virtual camera, and the options."""
         options = {"focal": self.focal, "distance": self.distance, "image_size": self.image_size, **self.options}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())

@@ -93,7 +93,6 @@ def _rotation_vector(change: Change, rvec: Tensor, options: Mapping[str, float])
 
 
 _MANY = 16
-_ROUNDING = 0.01
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
 
 
@@ -309,7 +308,7 @@ def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
             check_rotation(rotations[wrong][:1], name, owner)
     elif kind == "pitch_yaw" and value.is_cpu and not value.requires_grad:
         # with room for the rounding of half precision
-        beyond = value.abs() > value.new_tensor([math.pi / 2, math.pi]) * (1 + _ROUNDING)
+        beyond = value.abs() > value.new_tensor([math.pi / 2, math.pi]) * 1.01
         if known_false(~beyond):
             pitch, yaw = value[beyond.any(-1)][0].tolist()
             raise ValueError(
@@ -394,9 +393,9 @@ def together(
     The results have a batch dim, as `named` has, if samples of the form have one.
     """
     part, batched = change.parts[0], form.batched
-    if part.moves is None or part.rows is not None or change.gate is not None:
+    if part.moves is None or part.rows is not None or change.gate is not None or not form.count:
         return {}
-    if not form.count or (between := part.between()) is None:
+    if (between := part.between()) is None:
         return {}
     source, target, rotation = between
     moved = part.moves if isinstance(part.moves, Drawn) and change.count == 1 else None
@@ -410,19 +409,15 @@ def together(
 
     settings = sizes, source.dtype, options, mask_fill, moved is None, is_turn, thread_count()
     names, call = form.call(settings, find)
-    if (
-        call is None
-        or max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != form.count
-    ):
+    most = max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9)
+    if call is None or most != form.count:
         return {}
     values = [named[name][1] if batched else named[name][1][0] for name in names]
     made = call(source, target, rotation, values) if are_free(*values) else None
     results: dict[str, tuple[Tensor, Tensor | None]] = {}
     for name, value, result in zip(names, values, made or (), strict=bool(made)):
         if result is not None:
-            moved_value, valid = result
-            same = moved_value.dtype == value.dtype
-            results[name] = moved_value if same else in_range(moved_value, value.dtype), valid
+            results[name] = in_range(result[0], value.dtype), result[1]
     return results
 
 

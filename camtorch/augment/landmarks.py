@@ -86,18 +86,15 @@ class Table:
 
 def as_table(value: TableLike, owner: str) -> Table:
     """Return the table that a name, an order, or a list of pairs stands for."""
+    wanted = f"{owner}: landmarks must be one of {', '.join(LANDMARKS)}, an order or a list of pairs"
     if isinstance(value, str):
         if value not in LANDMARKS:
-            raise ValueError(
-                f"{owner}: landmarks must be one of {', '.join(LANDMARKS)}, an order or a list of pairs; got {value!r}"
-            )
+            raise ValueError(f"{wanted}; got {value!r}")
         return Table(LANDMARKS[value], True)
     try:
         items: list[Any] = list(value)
     except TypeError:
-        raise TypeError(
-            f"{owner}: landmarks must be one of {', '.join(LANDMARKS)}, an order or a list of pairs; got {shown(value)}"
-        ) from None
+        raise TypeError(f"{wanted}; got {shown(value)}") from None
     pairs: list[tuple[int, ...]] = []
     if items and all(isinstance(item, Iterable) for item in items):
         pairs = [tuple(as_whole(i, "landmarks", owner) for i in pair) for pair in items]

@@ -51,13 +51,10 @@ class RandomShutter(Augmentation):
             "rates": as_range(rates, "rates", name, least=-3600, most=3600, size=3),
             "readout": as_range(readout, "readout", name, least=-1, most=1),
         }
-        super().__init__(ranges, **options)
+        super().__init__(ranges, min_filled=0, **options)  # only the rim may be empty
         self.direction: Direction = one_of(direction, DIRECTIONS, "direction", name)
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._like(source, self._values(source, draw))
         shutter = RollingShutter(values["readout"], torch.deg2rad(values["rates"]), direction=self.direction)
         return Part(rows, ShutterWarp(source, source, target_shutter=shutter, **self.options), source)
-
-    def tell_of_empty_images(self, camera: Camera) -> None:
-        """Do not warn: only the rim may be empty."""

@@ -193,6 +193,5 @@ class CanonicalCamera(SampleTransform):
         return by_kinds(count, camera, part)
 
     def extra_repr(self) -> str:
-        """Return the focal length, the scaled quantity and the size of images in words."""
         size = "" if self.image_size is None else f", image_size={self.image_size}"
         return f"focal={self.focal:g}, scales={self.scales!r}{size}"

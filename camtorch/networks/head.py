@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Collection, Sequence
 from contextlib import nullcontext
@@ -70,13 +71,6 @@ class CameraHead(GeometryModule):
     shared_focal: bool
     names: tuple[str, ...]
     linear: nn.Linear
-    _discs: Tensor
-    _scales: Tensor
-    _start: Tensor
-    _far: Tensor
-    _ratio: Tensor
-    _middle: Tensor
-    _lens: Tensor
 
     def __init__(
         self,
@@ -124,17 +118,14 @@ class CameraHead(GeometryModule):
         share = (2 * given - least - most) / (most - least) if most > least else 0.0
         share = min(max(share, -1 + 1e-6), 1 - 1e-6)
         filled = Limits(asked.kind, prior.lens).filled(prior.lens[None], discs.new_full((1, 1), prior.discs[1]))
-        constants = {
-            "_discs": discs,
-            "_scales": scales[:, self._coefficients].log(),
-            "_start": discs.new_tensor(share / math.sqrt(1 - share * share)),
-            "_far": prior.focal * filled[0, 0],
-            "_ratio": discs.new_tensor(prior.aspect),
-            "_middle": discs.new_tensor(prior.middle),
-            "_lens": prior.lens,
-        }
-        for name, value in constants.items():
-            self.register_buffer(name, value, persistent=False)
+        constant = functools.partial(nn.Buffer, persistent=False)
+        self._discs: Tensor = constant(discs)
+        self._scales: Tensor = constant(scales[:, self._coefficients].log())
+        self._start: Tensor = constant(discs.new_tensor(share / math.sqrt(1 - share * share)))
+        self._far: Tensor = constant(prior.focal * filled[0, 0])
+        self._ratio: Tensor = constant(discs.new_tensor(prior.aspect))
+        self._middle: Tensor = constant(discs.new_tensor(prior.middle))
+        self._lens: Tensor = constant(prior.lens)
         self.linear = nn.Linear(features, len(self.names))
         nn.init.zeros_(self.linear.weight)
         nn.init.zeros_(self.linear.bias)
@@ -209,8 +200,7 @@ class CameraHead(GeometryModule):
         return self.model.__name__
 
     def extra_repr(self) -> str:
-        """Return the model, the image size and the names of the numbers in words."""
-        return f"{self.model.__name__}, image_size={self.image_size}, numbers=({' '.join(self.names)})"
+        return f"{self._model_name()}, image_size={self.image_size}, numbers=({' '.join(self.names)})"
 
 
 def _bound(x: Tensor) -> Tensor:
