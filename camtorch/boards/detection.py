@@ -68,18 +68,15 @@ def _chessboard(cv2: Any, board: Chessboard, grey: Grey) -> Pixels:
         return _no_pixels(board)
     scale = np.array([grey.shape[1] / small.shape[1], grey.shape[0] / small.shape[0]])
     grid = (corners.reshape(board.rows, board.columns, 2).astype(np.float64) + 0.5) * scale - 0.5
-    return _at_gradients(cv2, grey, _order_grid(grey, grid))
-
-
-def _order_grid(grey: Grey, grid: Pixels) -> Pixels:
-    """Return a grid (rows, columns, 2), found from any corner, in the board's order."""
+    # the corners were found from any one on
     right, down = (grid[:, -1] - grid[:, 0]).mean(0), (grid[-1] - grid[0]).mean(0)
     if right[0] * down[1] < right[1] * down[0]:  # boards are seen from the front
         grid = grid[:, ::-1]
     orders = [np.rot90(grid, k) for k in ((0, 2) if grid.shape[0] != grid.shape[1] else (0, 1, 2, 3))]
     # if a board begins with white in every order, none is better
     orders = [order for order in orders if _begins_with_black(grey, order)] or orders
-    return np.ascontiguousarray(min(orders, key=lambda order: float(order[0, 0].sum())))
+    first = min(orders, key=lambda order: float(order[0, 0].sum()))
+    return _at_gradients(cv2, grey, np.ascontiguousarray(first))
 
 
 def _begins_with_black(grey: Grey, grid: Pixels) -> bool:

@@ -26,12 +26,8 @@ from camtorch.values.arguments import as_flag, as_number, as_whole, hinting, no_
 from camtorch.values.threads import on_one_thread
 
 STEPS = 300
-_MANY = 100  # coefficients, at most
-_OUTLIER = 3.0  # standard deviations
-_ROUNDS = 20
 _SMOOTH = 0.02  # the weight of a surface's second differences, in px, see `Camera.smoothness`
 _BESIDE = 1e-3  # radians from the axis: the second point that holds a surface's frame
-_SECOND_LOOKS = 3  # the most searches for better poses
 _AS_GOOD = 9.0  # variances: optima whose costs differ by less are equally good
 
 
@@ -84,19 +80,17 @@ def as_model(
             raise ValueError(f"{owner}: count must be that of the start, {start.distortion.shape[-1]}; got {count}")
         count = start.distortion.shape[-1]
     count = model.default_count if count is None else as_whole(count, "count", owner)
-    if (names := model.names_of(count) if 0 <= count <= max(_MANY, model.default_count) else None) is None:
+    if (names := model.names_of(count) if 0 <= count <= max(100, model.default_count) else None) is None:
         raise ValueError(f"{owner}: count must fit {model.__name__}, {model.counts_text()}; got {count}")
     names = (*INTRINSICS, *names)
     if not isinstance(fixed, Collection) or isinstance(fixed, Mapping):
         raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
     fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
-    if start is not None and model.smoothness() is not None:
-        fixed = (*fixed, *INTRINSICS)  # a surface can replace these
     if unknown := [name for name in fixed if name not in names]:
         raise ValueError(f"{owner}: fixed must name parameters of {model.__name__}, {', '.join(names)}; got {unknown}")
     if start is not None:
-        fixed = *fixed, *frozen_names(start)
-    if start is None and {"fx", "fy"} & set(fixed):
+        fixed = *fixed, *frozen_names(start), *(INTRINSICS if model.smoothness() is not None else ())
+    elif {"fx", "fy"} & set(fixed):
         raise ValueError(f"{owner}: start must be a camera if fx or fy is fixed; got None")
     return Model(model, count, start, torch.tensor([name not in fixed for name in names], device="cpu"))
 
@@ -235,7 +229,7 @@ class Search:
             given = [t.detach().to(seen.pixels).reshape(1, -1) for t in asked.start._tensors]
             first = poses_for(torch.cat(given, -1), seen, asked.kind, size)
         adjusted = optimum(first)
-        for _ in range(_SECOND_LOOKS):
+        for _ in range(3):
             other = other_poses(adjusted, seen, asked.kind, size)
             again = adjusted if other is adjusted.state else optimum(other)
             if not bool(again.cost < adjusted.cost):
@@ -358,8 +352,8 @@ def noise_of(
     lengths = torch.linalg.vector_norm(residuals, dim=-1)
     inliers = seen & valid
     whole = sigma = sigma_of(lengths[inliers])
-    for _ in range(_ROUNDS):
-        found = seen & valid & (lengths < _OUTLIER * max(loss_scale, float(sigma)))
+    for _ in range(20):
+        found = seen & valid & (lengths < 3 * max(loss_scale, float(sigma)))
         if torch.equal(found, inliers):
             break
         inliers, sigma = found, sigma_of(lengths[found])

@@ -33,9 +33,6 @@ class Search(NamedTuple):
     loss_scale: float = 1.0
 
 
-_NONE = Search(0, 0.0, 0.0, 0.0)
-
-
 class Solved(NamedTuple):
     """B poses, with the fields of `pnp.Pose`; rms is infinite if a pose is not valid."""
 
@@ -56,22 +53,20 @@ def from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Te
     """Return rotations (B, 2, 3, 3), translations and valid as `poses_from_rays` does; row b sees points[b % P]."""
     count = len(rays)
     rotations, translations = rays.new_empty(count, 2, 3, 3), rays.new_empty(count, 2, 3)
-    valid = torch.empty(count, 2, dtype=torch.bool, device="cpu")
-    _run(None, points, rays, None, weights, _FROM_RAYS, _NONE, 0.0, (rotations, translations, valid))
-    return rotations, translations, valid
+    results = rotations, translations, torch.empty(count, 2, dtype=torch.bool, device="cpu")
+    _run(None, points, rays, None, weights, _FROM_RAYS, Search(0, 0.0, 0.0, 0.0), 0.0, results)
+    return results
 
 
 def refine_poses(
     native: Native, points: Tensor, pixels: Tensor, weights: Tensor, start: tuple[Tensor, Tensor], search: Search
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return rotations, translations and costs (B,) of the minima near `start`; row b sees points[b % P]."""
-    while True:
-        rotations, translations = (t.clone(memory_format=torch.contiguous_format) for t in start)
-        converged, costs = torch.empty(len(pixels), dtype=torch.bool, device="cpu"), pixels.new_empty(len(pixels))
-        results = rotations, translations, converged, costs
-        if not _run(native, points, None, pixels, weights, _REFINED, search, 0.0, results):
-            return rotations, translations, costs
-        native.follow()
+    converged, costs = torch.empty(len(pixels), dtype=torch.bool, device="cpu"), pixels.new_empty(len(pixels))
+    rotations, translations = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in start)
+    results = rotations, translations, converged, costs
+    _run(native, points, None, pixels, weights, _REFINED, search, 0.0, results, start)
+    return rotations, translations, costs
 
 
 def solve_poses(
@@ -86,17 +81,13 @@ def solve_poses(
     """Return the poses of points (P, N, 3) at pixels (B, N, 2); a `start` is for points about their seen middle."""
     batch, count, _ = pixels.shape
     native.add_table()
-    while True:
-        rotations, translations = pixels.new_empty(batch, 3, 3), pixels.new_empty(batch, 3)
-        if start is not None:
-            rotations, translations = start[0].clone(), start[1].clone()
-        vectors, rms, covariance = (pixels.new_empty(batch, *size) for size in ((3,), (), (6, 6)))
-        valid, inliers = (torch.empty(size, dtype=torch.bool, device="cpu") for size in (batch, (batch, count)))
-        results = rotations, translations, valid, None, vectors, rms, inliers, covariance
-        task = _SOLVED if start is None else _AGREED
-        if not _run(native, points, None, pixels, weights, task, search, threshold, results):
-            return Solved(vectors, translations, rms, valid, inliers, covariance)
-        native.follow()
+    sizes = (3, 3), (3,), (3,), (), (6, 6)
+    rotations, translations, vectors, rms, covariance = (pixels.new_empty(batch, *size) for size in sizes)
+    valid, inliers = (torch.empty(size, dtype=torch.bool, device="cpu") for size in (batch, (batch, count)))
+    results = rotations, translations, valid, None, vectors, rms, inliers, covariance
+    task = _SOLVED if start is None else _AGREED
+    _run(native, points, None, pixels, weights, task, search, threshold, results, start or ())
+    return Solved(vectors, translations, rms, valid, inliers, covariance)
 
 
 class Errors(NamedTuple):
@@ -172,14 +163,15 @@ def _run(
     search: Search,
     threshold: float,
     results: tuple[Tensor | None, ...],
-) -> int:
-    """Run the compiled task, and return how many points need lens values that are not known yet."""
+    start: tuple[Tensor, ...] = (),
+) -> None:
+    """Run the compiled task, again if points need lens values that are not known yet. `start`: the first results."""
     compiled = library()
     assert compiled is not None  # see `can_search`
     given = [None if t is None else t.contiguous() for t in (points, rays, pixels, weights)]
     rows = next(t for t in (rays, pixels) if t is not None)
     batch, count = rows.shape[:2]
-    counters = (c_int64 * 2)()
+    counters, threads = (c_int64 * 2)(), min(thread_count(), batch, 1 + batch * count // _SHARED) if batch > 1 else 1
     call = _Poses(
         0 if native is None else native.pointer,
         *(0 if t is None else t.data_ptr() for t in given),
@@ -188,8 +180,14 @@ def _run(
         *(0 if t is None else t.data_ptr() for t in results),
         *(*[0] * (8 - len(results)), addressof(counters), addressof(counters) + 8),
     )
-    threads = min(thread_count(), batch, 1 + batch * count // _SHARED) if batch > 1 else 1
-    spread(lambda: compiled.camtorch_poses(call), threads)
-    if counters[1] < 0:
-        raise MemoryError(f"no memory for poses of {count} points")
-    return counters[1]
+    while True:
+        for to, first in zip(results, start, strict=False):
+            assert to is not None
+            to.copy_(first)
+        counters[:] = [0, 0]
+        spread(lambda: compiled.camtorch_poses(call), threads)
+        if counters[1] < 0:
+            raise MemoryError(f"no memory for poses of {count} points")
+        if not counters[1] or native is None:
+            return
+        native.follow()

@@ -17,8 +17,6 @@ from camtorch.calibration.verdict import Calibration
 from camtorch.cameras.camera import MODELS, Camera
 from camtorch.cameras.freezing import INTRINSICS
 
-Array = NDArray[Any]
-
 CANDIDATES: tuple[tuple[str, int], ...] = (  # models that are tried, with their numbers of coefficients
     ("pinhole", 0),
     ("brown_conrady", 5),
@@ -44,7 +42,7 @@ class Trial:
     count: int
     rms: float  # px per point of all views together, NaN if it failed
     held_out: float  # px per point of held-out views, to which only poses were fitted; NaN if it failed
-    errors: Array  # (V,) mean squared of each view, held out
+    errors: NDArray[Any]  # (V,) mean squared of each view, held out
     reason: str = ""  # why it failed, or empty
 
 
@@ -89,7 +87,7 @@ def select(
     points = seen.points.cpu().numpy()
     pixels = np.where(seen.seen[..., None].cpu(), seen.pixels.cpu(), np.nan)
 
-    def calibrated(rows: Array, model: str | Camera, **options: Any) -> Calibration:
+    def calibrated(rows: NDArray[Any], model: str | Camera, **options: Any) -> Calibration:
         return calibrate(model, points[rows], pixels[rows], image_size=layout.image_size, **options)
 
     weights, tried, trials = np.isfinite(pixels[..., 0]).sum(1), list(candidates), []

@@ -36,7 +36,6 @@ _CHANGED = 0.9  # of a view's error in the round before: below it another round 
 _TRIMMED = 0.8  # the part of the views, those with the least errors, that rank a lens
 _LEAST_SCALE = 0.5  # px, the least scale of robust weights
 _NO_PIXEL = 1e3  # px, the error of a corner without a pixel
-_OUTLIER = 3.0  # times the scale: an outlier's error
 _LEAST_SLOPE = 1e-3  # the least slope of a lens at the axis when a search starts
 _WORSE, _LITTLE_WORSE = 2.0, 1.01  # times the least cost: cameras above it are dropped
 _ALIKE = 1e-3  # the relative difference below which two starts are one
@@ -171,10 +170,6 @@ class _Lens(NamedTuple):
     def camera(self) -> Camera:
         return fixed_camera(self.model, self.parameters[:, :4], self.parameters[:, 4:], self.image_size)
 
-    def errors(self, some: Observations) -> Tensor:
-        """Return the errors (B, V, N) in px, NaN if a corner is unseen."""
-        return _errors(self.camera, self.boards, some)
-
     def lost(self, some: Observations) -> Tensor:
         """Whether seen corners have no pixel, (B, V, N) bool."""
         _, valid = self.camera.project(self.boards.moved(some.points).flatten(1, 2))
@@ -256,7 +251,7 @@ def _find_unified(few: Observations, image_size: tuple[int, int], fixed: Collect
         begun = lens.boards, errors[rows]
     free = _free_parameters(UCM, 1, [name for name in fixed if name in ("cx", "cy")])
     lens = lens.adjusted(few, free, _STEPS, _WORSE).of(slice(1))
-    return _choose_poses(lens, few, lens.errors(few))
+    return _choose_poses(lens, few, _errors(lens.camera, lens.boards, few))
 
 
 def _find_poses(
@@ -365,7 +360,7 @@ def _fit_model(lens: _Lens, few: Observations, model: type[Camera], count: int, 
     camera = lens.camera
     slopes = views.focal_at_axis(camera)
     rays = torch.nn.functional.normalize(lens.boards.moved(few.points), dim=-1)
-    inliers = few.seen & (lens.errors(few) < _OUTLIER * lens.scale)
+    inliers = few.seen & (_errors(camera, lens.boards, few) < 3 * lens.scale)
     reach = torch.where(inliers, angles_from_axis(rays), 0.0).amax((-1, -2))
     names = model.names_of(count) or ()
     ideal = slopes.new_tensor(model.ideal(count))

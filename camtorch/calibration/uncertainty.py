@@ -50,18 +50,15 @@ class Spread(NamedTuple):
         Points move to each board's frame by its pose and back by its noisy pose, and the noisy camera projects their
         mean: mrcal's mean-pcam. distance: (B, M) from the camera, or infinite.
         """
-        parts = zip(pixels.split(_PIXELS, 1), distance.split(_PIXELS, 1), strict=True)
-        return torch.cat([self._of_pixels(*part) for part in parts], 1)
-
-    def _of_pixels(self, pixels: Tensor, distance: Tensor) -> Tensor:
-        camera = fixed_camera(self.model, self.parameters[:, :4], self.parameters[:, 4:])
-        rays, valid = camera.unproject(pixels)
-        by_ray, by_parameters = pixel_jacobians(camera, rays)
-        by_turn = torch.linalg.cross(rays[:, :, None].expand_as(by_ray), by_ray, dim=-1)
-        slopes = torch.cat((by_parameters, by_turn, by_ray / distance[..., None, None]), -1)
-        moved = slopes @ self.factor[:, None]
-        known = valid & (by_parameters[..., 0, 2] > 0)  # the derivative by cx is 0 without a pixel
-        return torch.where(known[..., None, None], moved @ moved.mT, torch.nan)
+        camera, found = fixed_camera(self.model, self.parameters[:, :4], self.parameters[:, 4:]), []
+        for some, far in zip(pixels.split(_PIXELS, 1), distance.split(_PIXELS, 1), strict=True):
+            rays, valid = camera.unproject(some)
+            by_ray, by_parameters = pixel_jacobians(camera, rays)
+            by_turn = torch.linalg.cross(rays[:, :, None].expand_as(by_ray), by_ray, dim=-1)
+            moved = torch.cat((by_parameters, by_turn, by_ray / far[..., None, None]), -1) @ self.factor[:, None]
+            known = valid & (by_parameters[..., 0, 2] > 0)  # the derivative by cx is 0 without a pixel
+            found.append(torch.where(known[..., None, None], moved @ moved.mT, torch.nan))
+        return torch.cat(found, 1)
 
     def scaled(self, noise: Tensor) -> Spread:
         """Return the spread for corner noise (B,), px per coordinate, from the spread for noise of 1."""

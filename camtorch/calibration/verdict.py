@@ -135,10 +135,12 @@ class Calibration:
         # the noise does not cover errors of the model at rays far from any corner
         fine, rough = survey.good_within(_FINE, survey.reach + _BEYOND), survey.good_within(_ROUGH)
         if fine[1] > 0:
-            good = "Good for measuring up to {} from the optical axis, {} of the image".format(*_angle_and_share(fine))
+            good = (
+                f"Good for measuring up to {_degrees(fine[0])} from the optical axis, {_percent(fine[1])} of the image"
+            )
         good += f": projections are known to {_px(survey.middle)} in the middle (standard deviation)."
         if rough[1] > fine[1]:
-            good += " Good for looking at up to {}, {} of the image.".format(*_angle_and_share(rough))
+            good += f" Good for looking at up to {_degrees(rough[0])}, {_percent(rough[1])} of the image."
         ahead = "Four times as many views would halve the uncertainty."
         if survey.weak:
             ahead = f"Next, hold the board in {survey.weak} of the image, so near that its corners reach the edges."
@@ -313,10 +315,6 @@ def _px(value: float) -> str:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share > 0.095 else f"{100 * share:.2g} %"
-
-
-def _angle_and_share(good: tuple[float, float]) -> tuple[str, str]:
-    return _degrees(good[0]), _percent(good[1])
 
 
 def _degrees(angle: float) -> str:

@@ -106,7 +106,11 @@ class System:
             of_views = view.new_zeros(*view.shape[:2], 0)
         fine = torch.isfinite(whole).all(-1) & torch.isfinite(of_views).all(-1).all(-1)
         of_views, whole = torch.where(fine[:, None, None], of_views, 0.0), torch.where(fine[:, None], whole, 0.0)
-        return (of_views, whole), self.decrement - self._left(of_views, whole)
+        # the part of the decrement that remains after the step
+        steps = torch.cat((of_views, whole[:, None].expand(-1, of_views.shape[1], -1)), -1)
+        mine = (self.equations.view[..., :-1] @ steps[..., None])[..., 0] + self.equations.view[..., -1]
+        ours = (shared[:, :-1, :-1] @ whole[..., None])[..., 0] + shared[:, :-1, -1]
+        return (of_views, whole), self.decrement - (mine.square().sum((-1, -2)) + ours.square().sum(-1))
 
     def _compiled_step(self, damping: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
         given = [t.contiguous() for t in (self.equations.view, self.equations.shared, damping)]
@@ -120,14 +124,6 @@ class System:
         if left.value:
             raise MemoryError(f"no memory for {views} views. Pass fewer")
         return (of_views, whole), self.decrement - rest
-
-    def _left(self, of_views: Tensor, whole: Tensor) -> Tensor:
-        """Return the part (R,) of the decrement that remains after a step."""
-        view, shared = self.equations.view, self.equations.shared[:, :-1]
-        steps = torch.cat((of_views, whole[:, None].expand(-1, view.shape[1], -1)), -1)
-        mine = (view[..., :-1] @ steps[..., None])[..., 0]
-        ours = (shared[..., :-1] @ whole[..., None])[..., 0]
-        return (mine + view[..., -1]).square().sum((-1, -2)) + (ours + shared[..., -1]).square().sum(-1)
 
 
 def triangle_of_few(rows: Tensor) -> Tensor:

@@ -186,10 +186,6 @@ class PlanarAt(StageAt):
     """A `Planar` stage at points m = (a, b)."""
 
     stage: Planar
-    t: Tensor
-    factor: Tensor
-    slope: Tensor
-    twice_dot: Tensor
 
     def __init__(self, stage: Planar, a: Tensor, b: Tensor, order: int, t: Tensor | None):
         """Prepare what the properties share: derivatives if order is 1; t is |m|^2, if it is known."""
@@ -249,12 +245,6 @@ class PlanarAt(StageAt):
 
 class HomographyAt(StageAt):
     """A `Homography` at points."""
-
-    stage: Homography
-    depth: Tensor
-    reciprocal: Tensor
-    u: Tensor
-    v: Tensor
 
     def __init__(self, stage: Homography, a: Tensor, b: Tensor):
         super().__init__(stage, a, b)
@@ -366,10 +356,6 @@ class Shear(Stage):
 class Lens:
     """A chain of stages, the first of which sits on the chart's plane; no stages make the identity."""
 
-    is_radial: bool
-    radial: RadialFactor | None
-    rest: Lens | None
-
     def __init__(self, *stages: Stage):
         self.stages = stages
         self.is_radial = len(stages) == 1 and stages[0].is_radial
@@ -412,8 +398,6 @@ class Lens:
 
 class LensAt:
     """A chain of stages at points."""
-
-    value: tuple[Tensor, Tensor]
 
     def __init__(self, stages: Sequence[Stage], a: Tensor, b: Tensor, order: int, t: Tensor | None):
         self.stages: list[StageAt] = []

@@ -162,11 +162,6 @@ class InverseTable:
     at the fold from the inverse, and is as analytic in r2 as that.
     """
 
-    reach2: Tensor
-    most2: Tensor
-    values: Tensor
-    steps: Tensor
-
     def __init__(self, table: Tensor, *, is_constant: bool = False):
         """Split a `table` of `tabulate` into its parts, which are no views if `is_constant`."""
         self.is_constant = is_constant
@@ -235,14 +230,6 @@ def bracketed(radial: RadialFactor, r2: Tensor, safe_radius_sq: Tensor) -> Tenso
 
 class RadialInverse:
     """The inverse of a factor, graph-free, up to the squared radii of its fold and of the fold's image, `most2`."""
-
-    factor: type[RadialFactor]
-    radial: RadialFactor
-    end: float
-    of_points: bool
-    k: Tensor
-    safe_radius_sq: Tensor
-    most2: Tensor
 
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor], end: float):
         """Tabulate a class of factors, for coefficients (C, 1) of cameras or (M,) of single points, up to a radius."""

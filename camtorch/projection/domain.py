@@ -49,10 +49,6 @@ class Domain:
     terms give the radius up to which they certainly are; azimuths are followed only if a point lies further out.
     """
 
-    optics: Optics
-    k: Tensor
-    chart: Chart
-    lens: Lens
     is_constant: bool = False
     """Whether the domain is a constant of an exported program for other runtimes."""
 

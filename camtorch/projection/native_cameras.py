@@ -73,19 +73,6 @@ class DomainStruct(ctypes.Structure):
 class Plan:
     """The properties that all cameras of a model and a number of coefficients have in common."""
 
-    parts: ctypes.Array[_Part]
-    count: int
-    parameters: int
-    places: Tensor | None
-    is_all: bool
-    is_chart: bool
-    has_stages: bool
-    is_radial: bool
-    has_factor: bool
-    has_rest: bool
-    is_long: bool
-    """Whether a radial factor has so many numbers that its fold is not found by a root."""
-
     def __init__(self, chart: Chart, lens: Lens, parts: Sequence[_Part], coefficients: Sequence[Tensor]):
         """Make the plan of optics whose coefficients are columns, whatever their values."""
         self.parts, self.count = (_Part * len(parts))(*parts), len(parts)
@@ -99,6 +86,7 @@ class Plan:
         self.is_chart = isinstance(chart, optics.Inverted)
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
+        # a radial factor has so many numbers that its fold is not found by a root
         self.is_long = any(part.factor and part.n + part.m > _MOST_DEGREE for part in parts)
         self._ends: dict[torch.dtype, tuple[float, float]] = {}
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
@@ -144,9 +132,6 @@ _plans = Kept(64)  # keyed by optics and number of coefficients
 class Lenses:
     """The lenses of cameras (C,) in the form of the compiled geometry: numbers, and their domains as far as known."""
 
-    plan: Plan
-    cameras: int
-    dtype: torch.dtype
     struct: CamerasStruct
     """The lenses' part of the struct; pointers that are not set are of values that are not known yet."""
     _kept: list[object]
@@ -163,7 +148,12 @@ class Lenses:
         if plan.places is None and (constants := _constants(optics_of(columns(k))[1])):
             struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
         if plan.is_chart:
-            self._add_chart()
+            # the fold and the inverse of a chart that is defined in the other direction
+            table = torch.empty(self.cameras, TABLE_WIDTH, dtype=self.dtype, device="cpu")
+            struct.chart_safe_radius_sq, struct.chart_table = self._new(1), self._keep(table)
+            wanted = {"safe_radius_sq": struct.chart_safe_radius_sq, "table": struct.chart_table, "is_chart": True}
+            self._ask(wanted)
+            struct.chart_most2 = self._keep(table[:, 1])
         if plan.has_stages:
             self._add_domain(tables)
 
@@ -217,15 +207,6 @@ class Lenses:
 
     def _new(self, columns: int) -> int:
         return self._keep(torch.empty(self.cameras, columns, dtype=self.dtype, device="cpu"))
-
-    def _add_chart(self) -> None:
-        """Add the fold and the inverse of a chart that is defined in the other direction."""
-        table, safe_radius_sq = torch.empty(self.cameras, TABLE_WIDTH, dtype=self.dtype, device="cpu"), self._new(1)
-        place = self._keep(table)
-        self._ask({"safe_radius_sq": safe_radius_sq, "table": place, "is_chart": True})
-        struct = self.struct
-        struct.chart_safe_radius_sq, struct.chart_table = safe_radius_sq, place
-        struct.chart_most2 = self._keep(table[:, 1])
 
     def _add_domain(self, tables: bool) -> None:
         plan = self.plan
@@ -314,12 +295,6 @@ def lenses_of(plan: Plan, k: Tensor, make: Callable[[], Lenses]) -> Lenses:
 class Native:
     """Cameras (C,) of one model in the form of the compiled geometry."""
 
-    plan: Plan
-    struct: CamerasStruct
-    cameras: int
-    dtype: torch.dtype
-    parameters: int
-    pointer: int
     _kept: object
     _make_lenses: Callable[[Native], Lenses]
 

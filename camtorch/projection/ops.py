@@ -5,7 +5,7 @@ As operators they keep compiled graphs small, and can read values inside vmap as
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,8 +16,6 @@ from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.fold import AZIMUTHS
 from camtorch.projection.solve import search
 from camtorch.values.arguments import columns
-
-Result = TypeVar("Result")
 
 
 def _domain(model: str, k: Tensor) -> Domain:

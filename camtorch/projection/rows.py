@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.elsewhere import on_cpu
-from camtorch.evaluate.kept import Note, note
+from camtorch.evaluate.kept import note
 from camtorch.evaluate.known import known_true
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.domain import Domain, domain_of
@@ -36,13 +36,6 @@ class CameraRows:
     replaced by an ideal one, and all its results are invalid.
     """
 
-    given: tuple[Tensor, Tensor]
-    intrinsics: Tensor
-    k: Tensor
-    notes: tuple[Note, Note]
-    """The notes of the given tensors."""
-    usable: Tensor | None
-
     def __init__(self, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor):
         """Take concrete values (C, 4), (C, n); or (4,), (n,) of one camera."""
         self._model, self._learns = model, distortion.requires_grad
@@ -53,7 +46,8 @@ class CameraRows:
         values = first, second
         if intrinsics.ndim == 1:
             values = values[0][None], values[1][None]
-        self.given, self.usable = values, None
+        self.given = values
+        self.usable: Tensor | None = None
         is_plain = _are_plain(model, *values) if self._host is None else self._host.usable is None
         if not (is_plain or known_true(usable := _usable(model, *values))):
             ideal = _ideal(model, *values)
@@ -84,20 +78,21 @@ class CameraRows:
         """Return the cotangents of intrinsics and distortion, if wanted, for sums of `compiled.project_vjp`."""
         if sums is None:
             return None, None
-        return sums[:, :4] if wanted[0] else None, self._of_coefficients(sums[:, 4:]) if wanted[1] else None
-
-    def _of_coefficients(self, sums: Tensor) -> Tensor:
+        of_intrinsics, sums = sums[:, :4] if wanted[0] else None, sums[:, 4:]
+        if not wanted[1]:
+            return of_intrinsics, None
         assert self.native is not None  # it gave the sums
         plan = self.native.plan
         if plan.places is not None:
-            return sums if plan.is_all else torch.zeros_like(self.k).index_add_(1, plan.places, sums)
+            whole = sums if plan.is_all else torch.zeros_like(self.k).index_add_(1, plan.places, sums)
+            return of_intrinsics, whole
         with torch.enable_grad():
             k = self.k.detach().requires_grad_()
             chart, lens = self._model.optics(columns(k))
             pairs = zip((*chart.parameters, *lens.parameters), sums.split(1, -1), strict=True)
             outputs, of_outputs = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)
             (by_coefficients,) = torch.autograd.grad(outputs, k, of_outputs, materialize_grads=True)
-        return by_coefficients
+        return of_intrinsics, by_coefficients
 
 
 def single_native(model: type[CameraLike], intrinsics: Tensor, k: Tensor) -> Native | None:
