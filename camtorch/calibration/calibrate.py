@@ -14,7 +14,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.calibration.bundle import LOSSES, Adjusted, CameraObservations, Free, Poses, Prior, State, adjust
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
-from camtorch.calibration.start import as_seen, other_cameras, other_poses, poses_for, start_from_nothing
+from camtorch.calibration.start import Lens, as_seen, other_cameras, other_poses, poses_for, start_from_nothing
 from camtorch.calibration.uncertainty import noise_under, shared_factor, spread
 from camtorch.calibration.verdict import Calibration, check_determined
 from camtorch.cameras.camera import Camera
@@ -226,8 +226,8 @@ class Search:
                 first = start_from_nothing(seen, asked.kind, asked.count, size, fixed, self.loss, self.loss_scale)
             first = first.of(torch.arange(1, device=seen.pixels.device))
         else:
-            given = [t.detach().to(seen.pixels).reshape(1, -1) for t in asked.start._tensors]
-            first = poses_for(torch.cat(given, -1), seen, asked.kind, size)
+            given = torch.cat([t.detach().to(seen.pixels).reshape(1, -1) for t in asked.start._tensors], -1)
+            first = poses_for(Lens(asked.kind, given, Poses.none(1, 1, given), size), seen)
         adjusted = optimum(first)
         for _ in range(3):
             other = other_poses(adjusted, seen, asked.kind, size)
@@ -245,9 +245,8 @@ class Search:
     ) -> Adjusted:
         """Return the best optimum of this model's basins, if it has several."""
         state = adjusted.state
-        boards = _seen_from(state, camera)
-        learns, size = free.parameters[camera].cpu(), self.layout.image_size
-        starts = other_cameras(state.parameters[camera], learns, boards, self.seen, self.asked.kind, size)
+        lens = Lens(self.asked.kind, state.parameters[camera], _seen_from(state, camera), self.layout.image_size)
+        starts = other_cameras(lens, free.parameters[camera].cpu(), self.seen)
         if starts is None:
             return adjusted
         first = state.of(torch.zeros(len(starts), dtype=torch.long, device=starts.device))

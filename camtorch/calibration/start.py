@@ -13,6 +13,7 @@ from camtorch.calibration.bundle import SETTLED, Adjusted, CameraObservations, F
 from camtorch.calibration.observations import Observations
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.cameras.camera import Camera
+from camtorch.cameras.freezing import INTRINSICS
 from camtorch.cameras.opaque import fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.models import UCM, KannalaBrandt
@@ -90,9 +91,8 @@ def start_from_nothing(
                 f"calibrate: model must have pixels for all corners; got {one.model.__name__}, without {lost} of {seen}"
                 ". Use a fisheye, such as kannala_brandt"
             )
-    state = lens.of(slice(1)).state
-    if few is not observations:
-        state = poses_for(state.parameters[0], observations, model, image_size, lens.scale)
+    one = lens.of(slice(1))
+    state = one.state if few is observations else poses_for(one, observations)
     if len(lens.parameters) == 1:
         return state
     lens = lens._replace(boards=state.boards.expand(len(lens.parameters)))
@@ -101,15 +101,8 @@ def start_from_nothing(
     return found.state.of(found.cost.argmin()[None])
 
 
-def poses_for(
-    parameters: Tensor,
-    observations: Observations,
-    model: type[Camera],
-    image_size: tuple[int, int],
-    scale: float = _LEAST_SCALE,
-) -> State:
-    """Return the state of a known camera (1, 4 + n) and all views' poses; scale: px from which corners count less."""
-    lens = _Lens(model, parameters, Poses.none(1, 1, parameters), scale, image_size)
+def poses_for(lens: Lens, observations: Observations) -> State:
+    """Return the state of a known camera, B = 1, and all views' poses, whatever poses the lens has."""
     boards, errors = _find_poses(lens.camera, observations)
     return _choose_poses(lens._replace(boards=boards), observations, errors).state
 
@@ -117,7 +110,7 @@ def poses_for(
 def other_poses(found: Adjusted, observations: Observations, model: type[Camera], image_size: tuple[int, int]) -> State:
     """Return the state of an optimum, B = 1, with better poses for views that have them; the same state if none has."""
     state = found.state
-    lens = _Lens(model, state.parameters[0], state.boards, _LEAST_SCALE, image_size)
+    lens = Lens(model, state.parameters[0], state.boards, image_size)
     errors = _lengths(found.residuals[0], found.valid[0], observations.seen)[0]
     # views with greater errors than many others are doubted
     rows = errors.nanmedian(-1).values.argsort(descending=True)[:_DOUBTED]
@@ -133,34 +126,26 @@ def other_poses(found: Adjusted, observations: Observations, model: type[Camera]
     return state._replace(boards=state.boards.with_views(rows, Poses.where(is_other[0], others, boards)))
 
 
-def other_cameras(
-    parameters: Tensor,
-    learns: Tensor,
-    boards: Poses,
-    observations: Observations,
-    model: type[Camera],
-    image_size: tuple[int, int],
-) -> Tensor | None:
+def other_cameras(lens: Lens, learns: Tensor, observations: Observations) -> Tensor | None:
     """Return cameras (S, 4 + n) fitted from starts along the model's valley, see `_ALONG`, or None if it has none."""
-    count = parameters.shape[-1] - 4
-    names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))
-    along, _ = _ALONG.get(model.key, ("", ()))
+    count = lens.parameters.shape[-1] - 4
+    names = (*INTRINSICS, *(lens.model.names_of(count) or ()))
+    along, _ = _ALONG.get(lens.model.key, ("", ()))
     if not along or not bool(learns[names.index(along)]):
         return None
     fixed = [name for name, is_free in zip(names, learns.tolist(), strict=True) if not is_free]
-    lens = _Lens(model, parameters, boards, _LEAST_SCALE, image_size)
-    found = _fit_model(lens, observations, model, count, fixed).parameters
-    return torch.where(learns.to(found.device), found, parameters)
+    found = _fit_model(lens, observations, lens.model, count, fixed).parameters
+    return torch.where(learns.to(found.device), found, lens.parameters)
 
 
-class _Lens(NamedTuple):
+class Lens(NamedTuple):
     """Cameras of a model, parameters (B, 4 + n), with poses (B, V) of the boards."""
 
     model: type[Camera]
     parameters: Tensor
     boards: Poses
-    scale: float  # px: twice the median error of corners
     image_size: tuple[int, int]
+    scale: float = _LEAST_SCALE  # px: twice the median error of corners, from which they count less
 
     @property
     def state(self) -> State:
@@ -175,12 +160,12 @@ class _Lens(NamedTuple):
         _, valid = self.camera.project(self.boards.moved(some.points).flatten(1, 2))
         return some.seen & ~valid.view(-1, *some.seen.shape)
 
-    def of(self, rows: Tensor | slice) -> _Lens:
+    def of(self, rows: Tensor | slice) -> Lens:
         return self._replace(parameters=self.parameters[rows], boards=self.boards.of(rows))
 
     def adjusted(
         self, few: Observations, free: Free, steps: int, worst: float, loss: tuple[str | None, float] | None = None
-    ) -> _Lens:
+    ) -> Lens:
         """Return adjusted cameras, the best first, without doubles and costs above `worst` times the least."""
         name, scale = loss or ("cauchy", self.scale)
         settled = _NEARLY if loss is None else SETTLED
@@ -204,7 +189,7 @@ def as_seen(model: type[Camera], observations: Observations, prior: Prior | None
 
 def _free_parameters(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
     """Return the parameters that learn: all except those held by `fixed` or by the model."""
-    names = ("fx", "fy", "cx", "cy", *(model.names_of(count) or ()))
+    names = (*INTRINSICS, *(model.names_of(count) or ()))
     learns = [name not in fixed and model.fit_bounds.get(name, ()) is not None for name in names]
     return Free((torch.tensor(learns, device="cpu"),), (False,))
 
@@ -230,7 +215,7 @@ def _middle(image_size: tuple[int, int], like: Tensor) -> Tensor:
     return like.new_tensor([(image_size[1] - 1) / 2, (image_size[0] - 1) / 2])
 
 
-def _find_unified(few: Observations, image_size: tuple[int, int], fixed: Collection[str]) -> _Lens:
+def _find_unified(few: Observations, image_size: tuple[int, int], fixed: Collection[str]) -> Lens:
     """Return the unified camera that best explains the observations."""
     centre = _middle(image_size, few.pixels)
     reach = torch.where(few.seen, torch.linalg.vector_norm(few.pixels - centre, dim=-1), 0.0).amax()
@@ -239,7 +224,7 @@ def _find_unified(few: Observations, image_size: tuple[int, int], fixed: Collect
     focal = reach / centre.new_tensor(radii)[:, None]
     alpha = centre.new_tensor([alpha for alpha, _ in tried])[:, None]
     parameters = torch.cat((focal, focal, centre.expand(len(tried), 2), alpha), -1)
-    lens = _Lens(UCM, parameters, Poses.none(1, 1, parameters), _LEAST_SCALE, image_size)
+    lens = Lens(UCM, parameters, Poses.none(1, 1, parameters), image_size)
     begun = None
     for rounds, kept, unlike in ((1, len(tried), _FAR), (_ROUNDS, _KEPT, _UNLIKE)):
         boards, errors = _find_poses(lens.camera, few, rounds, begun)
@@ -327,7 +312,7 @@ def _lengths(residuals: Tensor, valid: Tensor, seen: Tensor) -> Tensor:
     return torch.where(seen, torch.where(valid, torch.hypot(*residuals.unbind(-1)), _NO_PIXEL), torch.nan)
 
 
-def _choose_poses(lens: _Lens, some: Observations, errors: Tensor) -> _Lens:
+def _choose_poses(lens: Lens, some: Observations, errors: Tensor) -> Lens:
     """Return a single camera with the best pose of each view: a plane has two similar ones; errors (1, V, N)."""
     camera = lens.camera
     old, errors = _resample_poses(camera, lens.boards, some, errors)
@@ -349,13 +334,13 @@ def _choose_poses(lens: _Lens, some: Observations, errors: Tensor) -> _Lens:
     return lens._replace(boards=first.with_views(rows, better))
 
 
-def _refine(lens: _Lens, few: Observations, free: Free, loss: tuple[str | None, float]) -> _Lens:
+def _refine(lens: Lens, few: Observations, free: Free, loss: tuple[str | None, float]) -> Lens:
     """Refine the cameras by a few steps, drop all but the nearly best, and refine the rest; the best comes first."""
     lens = lens.adjusted(few, free, _STEPS, _WORSE, loss)
     return lens if len(lens.parameters) == 1 else lens.adjusted(few, free, _MANY_STEPS, _LITTLE_WORSE, loss)
 
 
-def _fit_model(lens: _Lens, few: Observations, model: type[Camera], count: int, fixed: Collection[str]) -> _Lens:
+def _fit_model(lens: Lens, few: Observations, model: type[Camera], count: int, fixed: Collection[str]) -> Lens:
     """Fit cameras (S,) of another model to the corners, with the boards held."""
     camera = lens.camera
     slopes = views.focal_at_axis(camera)
@@ -398,4 +383,4 @@ def _fit_model(lens: _Lens, few: Observations, model: type[Camera], count: int, 
     for i, name in enumerate(("cx", "cy"), 2):
         if name in fixed:
             parameters[:, i] = (lens.image_size[3 - i] - 1) / 2
-    return _Lens(model, parameters, lens.boards.expand(len(parameters)), lens.scale, lens.image_size)
+    return lens._replace(model=model, parameters=parameters, boards=lens.boards.expand(len(parameters)))

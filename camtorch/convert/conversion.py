@@ -154,13 +154,13 @@ def _convert(task: _Task, count: int) -> _Result:
         starts = torch.cat((starts, taken[None]))
         parameters = torch.where(exact[:, None], torch.cat((source.intrinsics, taken), -1), parameters)
     if len(rows := (~exact).nonzero()[:, 0]):
-        parameters[rows] = fit(build(parameters), samples.observations.of(rows), starts[:, rows], slopes[rows])
+        parameters[rows] = fit(build(parameters), samples.of(rows), starts[:, rows], slopes[rows])
     result = _measure(task, parameters, exact)
     # the largest error of any camera of the model is at least the least rms
     rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
     if len(rows):
         these = task.of(rows)
-        observations = views.sample_with_rings(these.source.camera, task.image_size, _FIT_SIDE, task.limit).observations
+        observations = views.sample_with_rings(these.source.camera, task.image_size, _FIT_SIDE, task.limit)
         minimax = _measure(these, refine_minimax(build(parameters), observations, parameters[rows]), exact[rows])
         better = minimax.max_error < result.max_error[rows]
         better &= _reaches_as_far(minimax.max_angle, result.max_angle[rows])

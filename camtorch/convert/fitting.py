@@ -11,10 +11,9 @@ from camtorch.least_squares.equations import Equations, System, padded
 from camtorch.least_squares.jacobians import SensorPoints, sensor_jacobians, to_sensor
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, LEAST_DAMPING, minimise, rounding_of
 from camtorch.projection.camera_like import CameraLike
-from camtorch.rays.lattices import slopes_at_axis
+from camtorch.rays.lattices import angles_from_axis, slopes_at_axis
 from camtorch.values.arguments import columns
 
-_MOST_STEPS = 60
 _ROUNDS = 3
 _LAWSON_ROUNDS, _LAWSON_STEPS, _PATIENCE = 40, 2, 6
 _SETTLED = 1e-8  # the part of the cost left to gain at which a search ends
@@ -25,7 +24,7 @@ _LOST = 0.1  # the error, in focal lengths, of a ray without a pixel when altern
 
 
 class Observations(NamedTuple):
-    """The target of a fit: rays (C, N, 3), pixels (C, N, 2) and weights of the errors (C, N), 0 for no ray."""
+    """Rays (C, N, 3), their pixels (C, N, 2), and weights of the errors (C, N), 0 for no ray or no pixel."""
 
     rays: Tensor
     pixels: Tensor
@@ -33,6 +32,16 @@ class Observations(NamedTuple):
 
     def of(self, rows: Tensor) -> Observations:
         return Observations(*(t[rows] for t in self))
+
+    @property
+    def valid(self) -> Tensor:
+        """Whether there are both, bool (C, N)."""
+        return self.weights > 0
+
+    @property
+    def angles(self) -> Tensor:
+        """Angles (C, N) from the axis in radians."""
+        return angles_from_axis(self.rays)
 
 
 def fit(
@@ -67,7 +76,7 @@ def fit(
             weights = observations.weights * to_sensor(camera, parameters[:, 4:], observations.rays).covered
             more = (weights != within.weights).any(-1) & ~found
             within = observations._replace(weights=weights)
-            parameters = _refine(camera, within, parameters, low, high, more)
+            parameters = _Fit(camera, within, low, high).refined(parameters, more)
         score = _cost(camera, within, parameters)
         score = score + (observations.weights - within.weights).sum(-1) * (_LOST * slopes[:, :2].mean(-1)) ** 2
         found |= score <= tiny
@@ -115,8 +124,8 @@ def refine_minimax(camera: CameraLike, observations: Observations, parameters: T
         # weights are of errors, not of their squares
         weights = weights * (error / error.amax(-1, keepdim=True).clamp(min=_NOTHING)).sqrt()
         weights = weights / weights.amax(-1, keepdim=True).clamp(min=1e-30)
-        weighted = observations._replace(weights=weights)
-        parameters = _refine(camera, weighted, parameters, low, high, going, _LAWSON_STEPS, LEAST_DAMPING)
+        weighted = _Fit(camera, observations._replace(weights=weights), low, high)
+        parameters = weighted.refined(parameters, going, _LAWSON_STEPS, LEAST_DAMPING)
         error = _distances(observations, camera, parameters)
         better = going & (error.amax(-1) < least)
         best = torch.where(better[:, None], parameters, best)
@@ -191,18 +200,8 @@ class _Fit:
         new[:, self.free] += step[1]
         return (new.clamp(self.low[rows], self.high[rows]),)
 
-
-def _refine(
-    camera: CameraLike,
-    observations: Observations,
-    parameters: Tensor,
-    low: Tensor,
-    high: Tensor,
-    going: Tensor,
-    steps: int = _MOST_STEPS,
-    damping: float = FIRST_DAMPING,
-) -> Tensor:
-    """Return the parameters (C, P) of least cost near the given ones, for rows that are `going`."""
-    tiny, problem = _NOTHING**2 * observations.weights.sum(-1), _Fit(camera, observations, low, high)
-    found = minimise(problem, (parameters,), tolerance=_SETTLED, tiny=tiny, going=going, steps=steps, damping=damping)
-    return found.state[0]
+    def refined(self, parameters: Tensor, going: Tensor, steps: int = 60, damping: float = FIRST_DAMPING) -> Tensor:
+        """Return the parameters (C, P) of least cost near the given ones, for rows that are `going`."""
+        tiny = _NOTHING**2 * self.observations.weights.sum(-1)
+        found = minimise(self, (parameters,), tolerance=_SETTLED, tiny=tiny, going=going, steps=steps, damping=damping)
+        return found.state[0]

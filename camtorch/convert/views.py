@@ -16,27 +16,6 @@ _ANGLES, _AZIMUTHS, _RADII = 180, 16, 64  # samples of a whole camera
 _END_AHEAD = math.radians(87)  # the last angle of a camera without an image that does not see sideways
 
 
-class SampledRays(NamedTuple):
-    """Rays (C, N, 3) of a camera, their pixels (C, N, 2), and whether the camera has both, bool (C, N)."""
-
-    rays: Tensor
-    pixels: Tensor
-    valid: Tensor
-
-    def of(self, rows: Tensor) -> SampledRays:
-        return SampledRays(*(t[rows] for t in self))
-
-    @property
-    def observations(self) -> Observations:
-        """The observations for a camera that is fitted to these rays."""
-        return Observations(self.rays, self.pixels, self.valid.to(self.pixels.dtype))
-
-    @property
-    def angles(self) -> Tensor:
-        """Angles (C, N) from the axis in radians."""
-        return lattices.angles_from_axis(self.rays)
-
-
 class Lattice(NamedTuple):
     """Even steps from `low` to `high`, (C, 2) each: over pixels, or over the angles from the axis and azimuths."""
 
@@ -58,7 +37,7 @@ class Lattice(NamedTuple):
         inside = places.clamp(self.low[:, None], self.high[:, None])
         return inside if self.are_pixels else torch.stack((inside[..., 0], places[..., 1]), -1)
 
-    def sampled(self, camera: CameraLike, places: Tensor) -> SampledRays:
+    def sampled(self, camera: CameraLike, places: Tensor) -> Observations:
         """Return the rays of a camera at places (C, N, 2)."""
         if self.are_pixels:
             rays, found = camera.unproject(places)
@@ -66,7 +45,8 @@ class Lattice(NamedTuple):
             rays = lattices.polar_rays(*places.unbind(-1))
             found = torch.ones_like(rays[..., 0], dtype=torch.bool)
         pixels, valid = camera.project(rays)
-        return SampledRays(rays, pixels, valid & found & (lattices.angles_from_axis(rays) <= self.limit * (1 + 1e-12)))
+        valid = valid & found & (lattices.angles_from_axis(rays) <= self.limit * (1 + 1e-12))
+        return Observations(rays, pixels, valid.to(pixels.dtype))
 
 
 def lattice(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> Lattice:
@@ -88,28 +68,28 @@ def lattice(camera: CameraLike, image_size: tuple[int, int] | None, side: int, l
     return Lattice(low, high, side, True, limit)
 
 
-def sample(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
+def sample(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> Observations:
     """Return side^2 rays on the image or in all directions; those that the camera has up to `limit` are valid."""
     nodes = lattice(camera, image_size, side, limit)
     return nodes.sampled(camera, nodes.nodes())
 
 
-def sample_with_rings(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> SampledRays:
+def sample_with_rings(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> Observations:
     """Return `sample` with further rays on circles around the axis: errors of a radial lens change along radii."""
     whole = sample(camera, image_size, side, limit)
     reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
     rings = seen(camera, image_size, lattices.ray_fan(reach * torch.linspace(0, 1, _RADII, **_like(camera)), _AZIMUTHS))
-    return SampledRays(*(torch.cat(pair, 1) for pair in zip(whole, rings, strict=True)))
+    return Observations(*(torch.cat(pair, 1) for pair in zip(whole, rings, strict=True)))
 
 
-def seen(camera: CameraLike, image_size: tuple[int, int] | None, fan: Tensor) -> SampledRays:
+def seen(camera: CameraLike, image_size: tuple[int, int] | None, fan: Tensor) -> Observations:
     """Return the rays (C, A * N, 3) of a fan (C, A, N, 3); those on the image are valid."""
     rays = fan.flatten(1, 2)
     pixels, valid = camera.project(rays)
     if image_size is not None:
         low, high = lattices.image_edges(image_size, pixels)
         valid = valid & (pixels >= low).all(-1) & (pixels <= high).all(-1)
-    return SampledRays(rays, pixels, valid)
+    return Observations(rays, pixels, valid.to(pixels.dtype))
 
 
 def _reach(camera: CameraLike, limit: float) -> Tensor:

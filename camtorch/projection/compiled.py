@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable
 from ctypes import addressof, c_int64
 from itertools import accumulate
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -41,11 +42,16 @@ def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     return pixels, valid
 
 
-def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return unit rays (3, C, N) of pixels (C, N, 2), whether they exist (C, N), and what `unproject_vjp` needs.
+class Unprojected(NamedTuple):
+    """Unit rays (3, C, N), whether they exist (C, N), and points on the chart's plane (2, C, N), if needed."""
 
-    This is the points on the chart's plane (2, C, N), made if `keeps`.
-    """
+    rays: Tensor
+    valid: Tensor
+    solution: Tensor | None
+
+
+def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojected:
+    """Return rays of pixels (C, N, 2), and if `keeps`, also the results that `unproject_vjp` needs."""
     cameras, count, _ = pixels.shape
     rays = _empty((3, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
@@ -53,7 +59,7 @@ def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> tuple[Tens
     native.add_table()
     rows = pixels.data_ptr(), *pixels.stride(), rays.data_ptr(), count, 1, cameras * count, valid.data_ptr()
     _call_and_follow(native, cameras, count, UNPROJECT, (*rows, address(solution), *_NO_ROWS, 0))
-    return rays, valid, solution
+    return Unprojected(rays, valid, solution)
 
 
 def project_vjp(
