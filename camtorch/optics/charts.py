@@ -168,6 +168,8 @@ class EquidistantUpTo(Equidistant):
 
     code: ClassVar[int | None] = 1
 
+    last: Tensor
+
     def __init__(self, last: Tensor):
         self.last = last.detach()
 

@@ -356,6 +356,10 @@ class Shear(Stage):
 class Lens:
     """A chain of stages, the first of which sits on the chart's plane; no stages make the identity."""
 
+    is_radial: bool
+    radial: RadialFactor | None
+    rest: Lens | None
+
     def __init__(self, *stages: Stage):
         self.stages = stages
         self.is_radial = len(stages) == 1 and stages[0].is_radial

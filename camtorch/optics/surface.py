@@ -105,6 +105,13 @@ class Surface(Stage):
     code: ClassVar[int | None] = 19
     _at = SurfaceAt
 
+    columns: int
+    rows: int
+    order: int
+    cells: tuple[float, float]
+    centre: tuple[float, float]
+    behind: float
+
     def __init__(
         self,
         controls: Sequence[Tensor],
