@@ -63,7 +63,7 @@ def parse(record: Record) -> Rig:
 def render(rig: Rig, lossy: Lossy) -> str:
     """Return the text of a file; the cameras lose their names, and the IMU gets Basalt's defaults."""
     placed, models, sizes = [], [], []
-    for name, extrinsics in lossy.all_posed(rig).items():
+    for name, extrinsics in lossy.all_posed(lossy.numbered(rig)).items():
         camera = rig.cameras[name]
         height, width = lossy.size(name, camera)
         key, intrinsics, distortion = lossy.model(name, camera, {key for key, _ in _MODELS.values()})

@@ -79,7 +79,7 @@ def _pose(record: Record, undo: bool = False) -> Extrinsics:
 
 def render(rig: Rig, lossy: Lossy) -> str:
     """Return the text of a file; the cameras are renamed to cam0, cam1, ... in their order."""
-    lossy.no_images(rig)
+    lossy.no_images(rig := lossy.numbered(rig))
     posed = lossy.all_posed(rig) if rig.extrinsics or len(rig.cameras) > 1 else {}
     first = next(iter(posed.values()), None)
     chained = first is None or (len(posed) > 1 and poses.is_identity(first))

@@ -129,6 +129,13 @@ class Lossy:
             self.fail("cameras", f"{count}. On the command line choose one with --name")
         return next(iter(rig.cameras.items()))
 
+    def numbered(self, rig: Rig) -> Rig:
+        """Return the rig in the order in which the format numbers cameras; cam0, cam1, ... keep these names."""
+        names = [f"cam{i}" for i in range(len(rig.cameras))]
+        if {*names} != {*rig.cameras}:
+            return rig
+        return Rig({name: rig.cameras[name] for name in names}, rig.extrinsics, images=rig.images)
+
     def no_images(self, rig: Rig) -> None:
         """Refuse posed images if the format has only cameras."""
         if images := [name for name in rig.extrinsics if name in rig.images]:

@@ -54,6 +54,16 @@ def test_kalibr_models(tmp_path):
         assert_same(ct.load(path), ct.Rig({"cam0": camera}))
 
 
+@pytest.mark.parametrize("format", ["kalibr", "basalt"])
+def test_numbered_cameras_keep_their_names_in_any_order(tmp_path, format):
+    poses = {f"cam{i}": ct.Extrinsics(float64([0, 0, 0]), float64([i, 0, 0])) for i in (2, 0, 1)}
+    rig = ct.Rig({n: ct.Pinhole(float64([9, 9 + int(n[3]), 6, 4]), image_size=(9, 12)) for n in poses}, poses)
+    ct.save(rig, path := tmp_path / f"rig{SUFFIXES[format]}", format)
+    for name, camera in (found := ct.load(path)).items():
+        assert camera.fy == rig[name].fy
+        assert found.extrinsics[name].translation.tolist() == pytest.approx([int(name[3]), 0, 0], abs=1e-12)
+
+
 @pytest.mark.parametrize("name", ["aria_device_calibration.json", "basalt_calibration.json"])
 def test_poses_of_cameras_on_a_device_are_turned_round(name):
     rig = load(name)
