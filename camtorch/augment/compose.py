@@ -18,8 +18,6 @@ from camtorch.augment.ranges import Range, draw
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import as_mapping
 
-_OF_IMAGES = ("mode", "padding_mode", "fill", "tolerance")
-
 
 class Compose(Augmentation):
     """A chain of augmentations, each drawn for the camera that the one before returns, applied all at once.
@@ -88,7 +86,7 @@ class Compose(Augmentation):
         wanted = {**self.options, "mask_fill": self.mask_fill}
         for i, part in enumerate(parts):
             given = {**part.options, "mask_fill": part.mask_fill}
-            for key in (*_OF_IMAGES, "mask_fill"):
+            for key in ("mode", "padding_mode", "fill", "tolerance", "mask_fill"):
                 if given[key] not in (usual[key], wanted[key]):
                     raise ValueError(
                         f"{self._name}: images are sampled once, so parts must have one {key}; got {given[key]!r} of "

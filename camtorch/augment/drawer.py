@@ -239,7 +239,7 @@ class CameraDrawer(Augmentation):
         form, moves = batch.form, change.parts[0].moves
         if form.is_tried or form.batched or self.valid_mask or self.mirroring is not None or self._is_real:
             return
-        form.is_tried, (names, call) = True, form.found
+        form.is_tried, names, call = True, form.names, form.call
         flags = {"image_valid", *(f"{name}_valid" for name, _ in form.fields)}
         if call is None or not call.keeps_dtypes or not isinstance(moves, Drawn) or not flags.isdisjoint(sample):
             return

@@ -24,7 +24,6 @@ _NEARLY = 0.999
 _ZOOM = 4.0  # at most, before the camera turns back
 _FAR_ZOOM = 1000.0  # of a camera that is not turned
 _TURNS = 1.0, 0.5, 0.25, 0.0
-_HALVINGS = 10
 
 
 def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
@@ -123,7 +122,7 @@ def _least_zoom(
     """Return the least factor (*B,) from 1 to `most`, and the part of the image that is filled with it."""
     low, high = torch.ones_like(at_first), torch.full_like(at_first, most)
     high, at_high = torch.where(at_first >= share, low, high), at_first
-    for _ in range(_HALVINGS):
+    for _ in range(10):
         middle = (low * high).sqrt()
         at_middle = part_shown(middle)
         is_enough = at_middle >= share

@@ -24,10 +24,6 @@ PARTS = 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125
 """Parts of a step, in the order in which they are tried."""
 _SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move less than radial terms: as in real lenses
 _STEP = 1e-4
-_SIDE = 9
-_EDGE_SAMPLES = 32
-_AZIMUTHS = 128
-_ANGLES = 64
 _MOST_MEASURED = 64  # lenses
 
 
@@ -121,7 +117,7 @@ def _over(size: tuple[int, int]) -> Tensor:
     """Return pixels (N, 2) in float64, in even steps over images of a size, to their outer edges."""
     with torch.inference_mode(False):
         edges = torch.tensor([[-0.5, -0.5], [size[1] - 0.5, size[0] - 0.5]], dtype=torch.float64)
-        return pixel_lattice(edges[0], edges[1], _SIDE, _SIDE).flatten(0, 1)
+        return pixel_lattice(edges[0], edges[1], 9, 9).flatten(0, 1)
 
 
 def defined_or(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -161,17 +157,17 @@ def border(size: tuple[int, int], dtype: torch.dtype) -> Tensor:
     height, width = size
     with torch.inference_mode(False):
         corners = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]], dtype=torch.float64) - 0.5
-        return along_edges(corners, _EDGE_SAMPLES).to(dtype)
+        return along_edges(corners, 32).to(dtype)
 
 
 def lens_ends(camera: Camera, distortion: Tensor) -> Tensor:
     """Return the last point (*B, K, 2), in focal lengths, along every azimuth that lenses map."""
     ones = distortion.new_tensor([1.0, 1.0, 0.0, 0.0]).double()
     plane = remade(camera, intrinsics=ones, distortion=distortion.detach().double())
-    azimuths = torch.linspace(0, 2 * math.pi, _AZIMUTHS + 1, dtype=torch.float64, device=ones.device)[:-1]
+    azimuths = torch.linspace(0, 2 * math.pi, 128 + 1, dtype=torch.float64, device=ones.device)[:-1]
 
     def seen(rays: Tensor) -> tuple[Tensor, Tensor]:
         return plane.project(rays.expand(*plane.batch_shape, *rays.shape[-3:]))
 
-    ends = reach(lambda rays: seen(rays)[1], azimuths, steps=_ANGLES, rounds=2)
+    ends = reach(lambda rays: seen(rays)[1], azimuths, steps=64, rounds=2)
     return seen(polar_rays(ends, azimuths).unsqueeze(-2))[0].squeeze(-2)

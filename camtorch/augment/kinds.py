@@ -364,30 +364,19 @@ def in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
     return values.to(dtype)
 
 
-Found = tuple[list[str], SampleCall | None]
-"""The names of the fields that a call moves, and the call, if there is one."""
-
-
 class Form:
     """The form of samples: the fields that move, by name and kind, and the compiled call that moves them."""
 
     def __init__(self, fields: list[tuple[str, str]], batched: bool, count: int):
         self.fields, self.batched, self.count = fields, batched, count
-        self._settings: tuple[Any, ...] = ()
-        self.found: Found = [], None
+        self.settings: tuple[Any, ...] = ()  # with which `call` was made
+        self.names: list[str] = []  # of the fields that `call` moves
+        self.call: SampleCall | None = None
         self.ready: Any = None  # of random cameras, which have looked whether
         self.is_tried = False
 
-    def call(self, settings: tuple[Any, ...], find: Callable[[], Found]) -> Found:
-        """Return the names of fields and the call that moves them, kept for the last settings."""
-        if settings != self._settings:
-            self.found, self._settings = find(), copy.deepcopy(settings)
-        return self.found
 
-
-def together(
-    change: Change, named: Named, form: Form, mask_fill: float = 0.0, lateral: float = 0
-) -> dict[str, tuple[Tensor, Tensor | None]]:
+def together(change: Change, named: Named, form: Form, mask_fill: float) -> dict[str, tuple[Tensor, Tensor | None]]:
     """Move fields by one compiled call, with their validity: images, pixels, and for a single sample boxes and rays.
 
     The results have a batch dim, as `named` has, if samples of the form have one.
@@ -401,21 +390,19 @@ def together(
     moved = part.moves if isinstance(part.moves, Drawn) and change.count == 1 else None
     is_turn, options = moved is not None and moved.is_turn, part.moves.options
     sizes = part.camera._size_for("Warp"), part.image_size
-
-    def find() -> Found:
+    settings = sizes, source.dtype, options, mask_fill, moved is None, is_turn, thread_count()
+    if settings != form.settings:
         hows = _ways(named, options, mask_fill, source.dtype if moved is not None else None, is_turn, change.count == 1)
         values = [named[name][1] if batched else named[name][1][0] for name in hows]
-        return list(hows), call_for(sizes, source.dtype, options, values, [*hows.values()], batched) if hows else None
-
-    settings = sizes, source.dtype, options, mask_fill, moved is None, is_turn, thread_count()
-    names, call = form.call(settings, find)
+        form.call = call_for(sizes, source.dtype, options, values, [*hows.values()], batched) if hows else None
+        form.names, form.settings = list(hows), copy.deepcopy(settings)
     most = max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9)
-    if call is None or most != form.count:
+    if form.call is None or most != form.count:
         return {}
-    values = [named[name][1] if batched else named[name][1][0] for name in names]
-    made = call(source, target, rotation, values) if are_free(*values) else None
+    values = [named[name][1] if batched else named[name][1][0] for name in form.names]
+    made = form.call(source, target, rotation, values) if are_free(*values) else None
     results: dict[str, tuple[Tensor, Tensor | None]] = {}
-    for name, value, result in zip(names, values, made or (), strict=bool(made)):
+    for name, value, result in zip(form.names, values, made or (), strict=bool(made)):
         if result is not None:
             results[name] = in_range(result[0], value.dtype), result[1]
     return results

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch.augment.augmentation import FilledOptions
 from camtorch.augment.change import Part
 from camtorch.augment.drawer import Auto, CameraDrawer, LensOptions
 from camtorch.augment.kinds import Named
@@ -93,16 +92,10 @@ class RandomCamera(CameraDrawer):
         centre: Auto = "auto",
         distortion: Auto = "auto",
         crop: Auto = "auto",
-        chromatic: RangeLike | None = None,
-        vignetting: RangeLike | None = None,
-        cos4: RangeLike | None = None,
-        image_size: Sequence[int] | None = None,
-        **options: Unpack[FilledOptions],
+        **options: Unpack[LensOptions],
     ):
         given = {"yaw": yaw, "pitch": pitch, "roll": roll, "zoom": zoom, "fov": fov, "focal": focal, "centre": centre}
-        given |= {"distortion": distortion, "crop": crop}
-        beside = {"chromatic": chromatic, "vignetting": vignetting, "cos4": cos4}
-        super().__init__(like, given, image_size=image_size, **beside, **options)
+        super().__init__(like, {**given, "distortion": distortion, "crop": crop}, **options)
 
 
 class RandomMount(CameraDrawer):

@@ -90,7 +90,6 @@ class Unknown(Pinhole):
 
     @classmethod
     def of(cls, size: tuple[int, int]) -> Unknown:
-        """Make one for images of a size."""
         return cls(torch.tensor([1.0, 1.0, 0.0, 0.0]), image_size=size).requires_grad_(False)
 
 
@@ -447,13 +446,12 @@ class SampleTransform(KeepsCamera, nn.Module):
         return self._moved(sample, batch, change)
 
     def _moved(self, sample: Sample, batch: Batch, change: Change) -> Sample:
-        """Return the sample after a change."""
         moved, named, batched = dict(sample), batch.named, batch.form.batched
         options: dict[str, float] = {"mask_fill": self.mask_fill}
         if self.mirroring is not None:
             options["lateral"] = self.mirroring.lateral
         alike = not self.valid_mask and sample.get("image_valid") is None
-        known = together(change, named, batch.form, **options) if alike else {}
+        known = together(change, named, batch.form, self.mask_fill) if alike else {}
         for name, (found, value) in named.items():
             valid: Any
             if name in known:

@@ -115,9 +115,6 @@ def _wflw(path: Path) -> Opened:
     return [(f"line {i}", line) for i, line in lines if line.strip()], "wflw98"
 
 
-_ATTRIBUTES = ("pose", "expression", "illumination", "make_up", "occlusion", "blur")
-
-
 def _wflw_sample(samples: Samples, entry: tuple[str, bytes]) -> Sample:
     place = f"{samples.path}, {entry[0]}"
     if len(words := _text(entry[1], place).strip().split(maxsplit=206)) not in (197, 207):
@@ -128,7 +125,8 @@ def _wflw_sample(samples: Samples, entry: tuple[str, bytes]) -> Sample:
         if not set(words[200:206]) <= {"0", "1"}:
             raise ValueError(f"{place}: attributes must be 0 or 1; got {' '.join(words[200:206])}")
         sample["boxes"] = _numbers(words[196:200], place, "a box", 1, 4)
-        sample["attributes"] = dict(zip(_ATTRIBUTES, map(int, words[200:206]), strict=True))
+        names = "pose", "expression", "illumination", "make_up", "occlusion", "blur"
+        sample["attributes"] = dict(zip(names, map(int, words[200:206]), strict=True))
     return {**sample, "path": _find(samples, place, words[-1], ("WFLW_images", "images"))}
 
 

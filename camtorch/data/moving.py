@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -22,7 +22,6 @@ from camtorch.values.arguments import as_mapping, is_list, shown
 from camtorch.warp.proxy import ProxyWarp
 from camtorch.warp.warp import Warp
 
-Array: TypeAlias = "np.ndarray[Any, Any]"
 Batch = dict[str, Any]  # column -> an array or a list, all with as many rows
 Moves = Augmentation | FaceNormalizer | Warp  # transforms of samples
 _ENDINGS = ("jpg", "jpeg", "png", "webp", "ppm", "pgm", "tif", "tiff", "bmp", "npy")
@@ -212,7 +211,7 @@ def _is_objects(column: Any) -> bool:
     return isinstance(column, np.ndarray) and column.dtype == object
 
 
-def _column(values: list[Any]) -> Array:
+def _column(values: list[Any]) -> np.ndarray[Any, Any]:
     """Return rows as one array, of objects if their shapes or types differ."""
     if len({(getattr(v, "shape", None), getattr(v, "dtype", type(v))) for v in values}) == 1 and values[0] is not None:
         return np.stack(values) if isinstance(values[0], np.ndarray) else np.asarray(values)

@@ -19,8 +19,6 @@ from camtorch.values.arguments import as_image_size, as_number, no_camera, shown
 from camtorch.values.module import typed_as
 from camtorch.warp.affine import AffineWarp
 
-_LENGTHS = ("depth", "distance", "points", "tvec")
-
 
 class CanonicalCamera(SampleTransform):
     """A transform of samples to one focal length, so that a network learns metric depth from many cameras.
@@ -151,17 +149,17 @@ class CanonicalCamera(SampleTransform):
 
     def _lengths(self, found: str, value: Tensor, scale: Tensor, name: str) -> Tensor:
         """Return `value` (*B, ...) of the kind `found`, with all its lengths multiplied by `scale` (*B)."""
-        poses = found in ("head_pose", "pose")
-        if not poses and found not in _LENGTHS and (found != "landmarks" or value.shape[-1] != 3):
+        poses, lengths = found in ("head_pose", "pose"), ("depth", "distance", "points", "tvec")
+        if not poses and found not in lengths and (found != "landmarks" or value.shape[-1] != 3):
             return value
         if not value.is_floating_point():
             raise ValueError(f"{self._name}: {name} must be floating point, to be scaled; got {value.dtype}")
         factor = scale.to(value).reshape(*scale.shape, *[1] * (value.ndim - scale.ndim))
         if not poses:
             return value * factor
-        lengths = torch.zeros_like(value, dtype=torch.bool)
-        lengths[..., :3, 3] = True
-        return torch.where(lengths, value * factor, value)
+        places = torch.zeros_like(value, dtype=torch.bool)
+        places[..., :3, 3] = True
+        return torch.where(places, value * factor, value)
 
     def _resize_sample(self, sample: Sample, batch: Batch, change: Change) -> Sample:
         moved = self._moved(sample, batch, change)
