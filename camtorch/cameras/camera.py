@@ -14,19 +14,22 @@ from typing_extensions import Self, TypeVar
 
 from camtorch.cameras.catalogue import Catalogue
 from camtorch.cameras.editing import Editable
-from camtorch.cameras.freezing import PREFIX, Freezable, with_frozen
-from camtorch.cameras.numbers import camera_of_fov, check_fast, checked_numbers, described, numbers_of_matrix, replaced
+from camtorch.cameras.freezing import INTRINSICS, PREFIX, Freezable, frozen_names, with_frozen
+from camtorch.cameras.numbers import camera_of_fov, check_fast, checked_numbers, numbers_of_matrix, replaced
 from camtorch.convert.result import Conversion
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import is_predicted
+from camtorch.evaluate.known import is_predicted, values_of
 from camtorch.optics.model_spec import ModelSpec
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.evaluation import evaluate_points, evaluate_rows
 from camtorch.projection.project import PROJECT
 from camtorch.projection.unproject import UNPROJECT
+from camtorch.rays.depth import backproject
+from camtorch.rays.explanation import explain
 from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
 from camtorch.rays.lattices import field_of_view
+from camtorch.rays.polyline import project_polyline
 from camtorch.values.arguments import Numbers, broadcast_shapes, hinting, warn
 from camtorch.values.module import GeometryModule, typed_as
 
@@ -343,8 +346,6 @@ class Camera(Freezable, Editable):
         Returns:
             Pixels (M, 2) of each curve; none if nothing is seen. Points at which an edge is cut have no gradient.
         """
-        from camtorch.rays.polyline import project_polyline  # few calls need this package
-
         return project_polyline(self, points, extrinsics)
 
     _evaluate = evaluate_rows
@@ -444,8 +445,6 @@ class Camera(Freezable, Editable):
         Raises:
             ValueError: If the shape is wrong, the depth is of integers, or the kind is unknown.
         """
-        from camtorch.rays.depth import backproject  # few calls need this package
-
         return backproject(self, depth, kind)
 
     @property
@@ -480,8 +479,6 @@ class Camera(Freezable, Editable):
             ...", "beyond the fold at ... degrees: ..." or "beyond the edge of the surface at ..."; angles from the
             optical axis, along the azimuth of the point.
         """
-        from camtorch.rays.explanation import explain  # few calls need this package
-
         return explain(self, points)
 
     def convert(
@@ -538,7 +535,17 @@ class Camera(Freezable, Editable):
         return as_html(self)
 
     def extra_repr(self) -> str:
-        return described(self)
+        parts = [f"batch_shape={tuple(self.batch_shape)}"] if self.batch_shape else []
+        numbers = None if self.batch_shape else values_of(torch.cat(self._tensors, -1))
+        if numbers is not None:
+            names = *INTRINSICS, *self.distortion_names
+            parts += [f"{name}={value:.6g}" for name, value in zip(names, numbers.tolist(), strict=True)]
+        elif self.distortion_names:
+            parts.append(f"distortion=({' '.join(self.distortion_names)})")
+        if self.image_size:
+            parts.append(f"image_size={self.image_size}")
+        parts += [f"frozen=({', '.join(frozen)})"] if (frozen := frozen_names(self)) else []
+        return ", ".join(parts)
 
 
 def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:

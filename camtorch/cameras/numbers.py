@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch.cameras.freezing import INTRINSICS, frozen_names
 from camtorch.evaluate.known import are_free, is_kept, is_predicted, known_false, row_of, values_of
 from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
@@ -96,21 +95,6 @@ def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: 
 @functools.lru_cache(maxsize=256)
 def _names_of(model: type[CameraLike], count: int) -> tuple[str, ...] | None:
     return model.names_of(count)
-
-
-def described(camera: CameraLike) -> str:
-    """Return the batch, the size and, for a single camera, its numbers as text for `repr`."""
-    parts = [f"batch_shape={tuple(camera.batch_shape)}"] if camera.batch_shape else []
-    numbers = None if camera.batch_shape else values_of(torch.cat(camera._tensors, -1))
-    if numbers is not None:
-        names = *INTRINSICS, *camera.distortion_names
-        parts += [f"{name}={value:.6g}" for name, value in zip(names, numbers.tolist(), strict=True)]
-    elif camera.distortion_names:
-        parts.append(f"distortion=({' '.join(camera.distortion_names)})")
-    if camera.image_size:
-        parts.append(f"image_size={camera.image_size}")
-    parts += [f"frozen=({', '.join(frozen)})"] if (frozen := frozen_names(camera)) else []
-    return ", ".join(parts)
 
 
 def checked_intrinsics(model: type[CameraLike], intrinsics: Numbers) -> Tensor:

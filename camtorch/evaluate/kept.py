@@ -82,8 +82,7 @@ class Kept:
         return {"capacity": self.capacity}
 
 
-Mark = tuple[Any, ...]
-Note = tuple[Tensor, Mark | None]
+Note = tuple[Tensor, tuple[Any, ...] | None]
 """A record of a tensor, to know it by: its values and None, or the tensor, whose memory stays, and its mark."""
 
 
@@ -104,7 +103,7 @@ def same(tensor: Tensor, noted: Note) -> bool:
     return not tensor.is_inference() and noted[1] == mark(tensor)
 
 
-def mark(tensor: Tensor) -> Mark:
+def mark(tensor: Tensor) -> tuple[Any, ...]:
     """Return where values lie, on another device, and how often they were changed in place."""
     # dims of size one differ without a reason: a camera's numbers come as (n,) and as (1, n)
     steps = tuple(pair for pair in zip(tensor.shape, tensor.stride(), strict=True) if pair[0] != 1)

@@ -71,12 +71,10 @@ class GeometryModule(UnsharedState):
                 (state if module is None else parts)[name] = module
 
     def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
-        """Register a Parameter as `nn.Module` does."""
         super().register_parameter(name, param)
         self._note(name)
 
     def register_buffer(self, name: str, tensor: Tensor | None, persistent: bool = True) -> None:
-        """Register a buffer as `nn.Module` does."""
         super().register_buffer(name, tensor, persistent)
         self._note(name)
 

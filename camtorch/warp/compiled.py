@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -15,7 +16,7 @@ from camtorch.cameras.opaque import CameraNumbers, opaque
 from camtorch.evaluate.kept import Kept
 from camtorch.native.sampler import layout
 from camtorch.values.arguments import broadcast_shapes, one_of
-from camtorch.warp.grid import Lattice, Sampling, locate, tabulate
+from camtorch.warp.grid import locate, tabulate
 from camtorch.warp.sampling import MODES, PADDINGS, Sampler, render
 
 
@@ -94,10 +95,8 @@ def _warp(
     """Return images (B, C, h, w), plane by plane or with their channels last in memory; see `warped`."""
     antialias, padding, mode, padding_mode, fill, is_last = options
 
-    def found() -> Sampling | Lattice:
-        every = range(target._size_for("Warp")[0])
-        return locate(source, target, rotation, tolerance, antialias == "True", every, padding)
-
+    every = range(target._size_for("Warp")[0])
+    found = partial(locate, source, target, rotation, tolerance, antialias == "True", every, padding)
     inputs = [*source._tensors, *target._tensors, *([] if rotation is None else [rotation])]
     where = _located(inputs, (source._form, target._form, tolerance, antialias, padding, rotation is None), found)
     how = one_of(mode, MODES, "mode", "Warp"), one_of(padding_mode, PADDINGS, "padding_mode", "Warp")

@@ -8,7 +8,7 @@ from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
 from camtorch.poses.extrinsics import Extrinsics
-from camtorch.poses.rotations import rotate_planes, rotation_matrix
+from camtorch.poses.rotations import rotation_matrix, turn
 from camtorch.values.arguments import Numbers, as_batch, as_coordinates, check_devices
 from camtorch.warp.grid import Sampling, pixels_of_rows, scaled_rows, to_positions
 from camtorch.warp.moving import placed
@@ -61,13 +61,13 @@ class ProxyWarp(Warp):
         if not back:
             rotation, shift = rotation.mT, -(rotation.mT @ shift[..., None])[..., 0]
         near, meets = self._nearness(rays, of_source=not back)
-        directions = turned(rotation, rays) + beside(shift, rays) * near[..., None]
+        directions = turn(rotation, rays, "rays") + beside(shift, rays) * near[..., None]
         seen, mapped = target.project(off_poles(target, directions))
         return placed(target, seen, mapped & has_ray & meets, on_image)
 
     def transform_rays(self, rays: Numbers) -> Tensor:
         rays = as_coordinates(rays, "rays", 3, type(self).__name__, self.source.intrinsics.device, "B, *N")
-        return turned(self._pose()[0].mT.to(rays.dtype), rays)
+        return turn(self._pose()[0].mT.to(rays.dtype), rays, "rays")
 
 
 def check_pose(owner: str, extrinsics: Extrinsics, between: str, **cameras: Camera) -> torch.Size:
@@ -84,15 +84,6 @@ def check_pose(owner: str, extrinsics: Extrinsics, between: str, **cameras: Came
     if len(batch) > 1:
         raise ValueError(f"{owner}: cameras and extrinsics must have one batch dim at most; got {tuple(batch)}")
     return batch
-
-
-def turned(rotation: Tensor, rays: Tensor) -> Tensor:
-    """Return rays (B, *N, 3) or (*N, 3), turned by rotations (*B, 3, 3)."""
-    if rotation.ndim == 2:
-        return rotate_planes(rotation, rays.unbind(-1)).movedim(0, -1)
-    rows = rays.expand(len(rotation), *rays.shape[1:]) if len(rays) == 1 else rays
-    planes = rows.flatten(1, -2).unbind(-1)
-    return rotate_planes(rotation, planes).movedim(0, -1).reshape(max(len(rows), len(rotation)), *rows.shape[1:])
 
 
 def beside(vectors: Tensor, rays: Tensor) -> Tensor:

@@ -11,13 +11,13 @@ from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_plain, known_true
 from camtorch.poses.extrinsics import Extrinsics
-from camtorch.poses.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix, turn
 from camtorch.rays.depth import as_depth, depth_scale
 from camtorch.values.arguments import Numbers, check_devices, one_of, shown
 from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.panorama import off_poles, seam_of
-from camtorch.warp.proxy import beside, check_pose, turned
+from camtorch.warp.proxy import beside, check_pose
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, render
 from camtorch.warp.warp import as_sized
 
@@ -133,7 +133,7 @@ class Reproject(GeometryModule):
         if rays.ndim == 3:
             rays, has_ray = rays[None], has_ray[None]
         scale, good = depth_scale(depth, rays[:, None], has_ray[:, None], kind)
-        directions = turned(rotation_matrix(self.extrinsics.rotation).to(rays.dtype), rays)[:, None]
+        directions = turn(rotation_matrix(self.extrinsics.rotation).to(rays.dtype), rays, "rays")[:, None]
         shift = beside(self.extrinsics.translation, directions)
         # plane by plane is several times as fast
         parts = zip(shift.unbind(-1), directions.unbind(-1), strict=True)

@@ -118,7 +118,7 @@ def by_torch(
 def _by_torch(images: Tensor, where: Sampling, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
     """Sample B images by `grid_sample`."""
     count, dtype = images.shape[0], images.dtype
-    wide, finite = dtype == wide_dtype(dtype), not dtype.is_floating_point
+    wide = dtype == wide_dtype(dtype)
     if how.mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:
         # the nearest of integers (B, C, H, W), moved and not computed with: no float holds every id
         value = as_pixels(how.fill, images.dtype, images.device)
@@ -139,12 +139,12 @@ def _by_torch(images: Tensor, where: Sampling, how: Sampler, kept: dict[int, Pyr
     # the same for all strips of an image, however many cores are free: the pyramids that they keep are of these parts
     step = count if wide or not plain else 1 if large else thread_count()
     if not large and count <= step:
-        levels = _levels(kept, 0, widen(images), finite)
+        levels = _levels(kept, 0, widen(images))
         return narrow(_render(levels.images, where.grid, where, levels, how), dtype)
     result = images.new_empty(*images.shape[:2], *where.grid.shape[1:3])
     for i in range(0, count, step):
         part = slice(i, i + step)
-        levels = _levels(kept, i, images[part], finite)
+        levels = _levels(kept, i, images[part])
         here = where if where.grid.shape[0] == 1 else where.cameras(part)
         if large:
             _render_tiles(result[part], levels, here, how)
@@ -154,9 +154,9 @@ def _by_torch(images: Tensor, where: Sampling, how: Sampler, kept: dict[int, Pyr
     return result
 
 
-def _levels(kept: dict[int, Pyramid] | None, i: int, images: Tensor, finite: bool) -> Pyramid:
+def _levels(kept: dict[int, Pyramid] | None, i: int, images: Tensor) -> Pyramid:
     """Return the images from the i-th on: those kept, with the halves that they have got."""
-    return Pyramid(images, finite) if kept is None else kept.setdefault(i, Pyramid(images, finite))
+    return Pyramid(images) if kept is None else kept.setdefault(i, Pyramid(images))
 
 
 def _render_tiles(result: Tensor, levels: Pyramid, where: Sampling, how: Sampler) -> None:
@@ -200,7 +200,7 @@ def _render(images: Tensor, grid: Tensor, where: Sampling, levels: Pyramid, how:
     minifies = where.scale is not None
     # what lies beyond the rim is left out by coverage: at small levels the rim's pixels are wide
     beyond: PaddingMode = "border" if minifies and padding_mode == "zeros" else padding_mode
-    result = sample(images, grid, mode, beyond, levels.finite)
+    result = sample(images, grid, mode, beyond)
     if where.scale is not None:
         result = _minified(result, levels, where.grid, where.scale, mode, beyond)
     if any(fill) or padding_mode != "zeros" or minifies:
@@ -208,7 +208,7 @@ def _render(images: Tensor, grid: Tensor, where: Sampling, levels: Pyramid, how:
         if padding_mode == "zeros":
             # what part of a sample comes from the image, and not from the zeros around it
             ones = images.new_ones(1, 1, *images.shape[-2:]).expand(grid.shape[0], -1, -1, -1)
-            covered = sample(ones, grid, mode, "zeros", True)
+            covered = sample(ones, grid, mode, "zeros")
             result = torch.where(covered != 0, result * covered, 0) if minifies else result
             result = result + value * (1 - covered)
         else:
@@ -221,7 +221,6 @@ class Pyramid:
     """Images, and their half, a pyramid again, when it is asked for (Williams, Pyramidal Parametrics, 1983)."""
 
     images: Tensor
-    finite: bool
     _half: Pyramid | None = None
 
     @property
@@ -233,7 +232,7 @@ class Pyramid:
             step = 1 if self.images.dtype != wide_dtype(self.images.dtype) else self.images.shape[1]
             options: Any = {"mode": "bilinear", "align_corners": False, "antialias": True}
             halves = [F.interpolate(widen(part), size, **options) for part in self.images.split(step, 1)]
-            self._half = Pyramid(torch.cat(halves, 1), self.finite)
+            self._half = Pyramid(torch.cat(halves, 1))
         return self._half
 
 
@@ -245,7 +244,7 @@ def _minified(
     last = min(levels.images.shape[-2:]).bit_length() - 1
     for n in range(min(int(level.amax().ceil()) if may_look(level) else _TRACED_LEVELS, last)):
         levels = levels.half
-        smaller = sample(levels.images, grid, mode, padding_mode, levels.finite)
+        smaller = sample(levels.images, grid, mode, padding_mode)
         share = (level - n).clamp(0, 1).to(result)
         # an image without a share has no part either in what is not a number
         blended = torch.where(share < 1, torch.lerp(result, smaller, share), smaller)
@@ -253,11 +252,10 @@ def _minified(
     return result
 
 
-def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, finite: bool = False) -> Tensor:
+def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
     """Return `grid_sample` with align_corners=False of images (B, C, H, W) at a grid (B or 1, H', W', 2).
 
-    On a CPU an infinite or NaN pixel has a part in those bicubic samples alone in which it has a weight. finite: there
-    is none.
+    On a CPU an infinite or NaN pixel has a part in those bicubic samples alone in which it has a weight.
     """
     grid = grid.to(images.dtype)
     if not (isinstance(images.shape[0], int) and len(grid) == len(images)):  # an exported program is to say no more
@@ -265,12 +263,12 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, 
     if torch.compiler.is_compiling():  # which knows no jvp of one's own, nor needs it
         return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
     if are_plain(images, grid):
-        return _sample(images, grid, mode, padding_mode, finite)
+        return _sample(images, grid, mode, padding_mode)
     result: Tensor = _Sample.apply(images, grid, mode, padding_mode)  # type: ignore[no-untyped-call]
     return result
 
 
-def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode, finite: bool = False) -> Tensor:
+def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
     """Sample on a CPU with work for every thread; grid_sample gives one thread to each image."""
     where = Sampling(grid[:1] if grid.stride(0) == 0 else grid, images.new_empty(0), None)
     call = prepared(images, where, Sampler(mode, padding_mode, (0.0,))) if padding_mode == "zeros" else None
@@ -283,7 +281,7 @@ def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode,
         result = images.new_empty(*images.shape[:2], *grid.shape[1:3])
         for image in zip(result, images, grid, strict=True):
             _sample_tiles(*image, threads, mode, padding_mode)
-    if mode == "bicubic" and not finite and not math.isfinite(result.sum()):
+    if mode == "bicubic" and not math.isfinite(result.sum()):
         # where the bicubic result is not finite, pixels without a weight, but for rounding, lose their part in it
         b, y, x = (~torch.isfinite(result)).any(1).nonzero(as_tuple=True)
         height, width = images.shape[-2:]
