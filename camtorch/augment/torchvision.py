@@ -24,7 +24,6 @@ from camtorch.augment.sample import Frames, detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
 from camtorch.warp.arrays import as_planes_of
-from camtorch.warp.boxes import lattice_of, turned
 
 try:
     import PIL.Image
@@ -39,7 +38,6 @@ except Exception as error:  # a binary that does not match fails with a RuntimeE
 _OWNER = "torchvision.Transform"
 _KINDS = {PIL.Image.Image: "image", tv_tensors.Image: "image", tv_tensors.Video: "image", tv_tensors.Mask: "mask"}
 _KINDS |= {tv_tensors.BoundingBoxes: "boxes", tv_tensors.KeyPoints: "keypoints"}
-_TURNED, _STEPS = "polygons", 33  # rotated boxes move as points all over them, so many along each side
 _HELD = Tensor, np.ndarray
 
 
@@ -52,9 +50,8 @@ class Transform(FrontEnd, v2.Transform):
       nearest value.
     * `KeyPoints` (..., 2), in pixels whose centres are whole numbers. A point without a place on the new image becomes
       (-1, -1), also in all later transforms of camtorch.
-    * `BoundingBoxes` of every format, in torchvision's coordinates between pixel edges. The new boxes enclose the old
-      ones, rotated boxes along their moved x axis, and are not clamped. A box without a place becomes
-      (-1, -1, -1, -1) in XYXY.
+    * `BoundingBoxes` of a format without rotation, in torchvision's coordinates between pixel edges. The new boxes
+      enclose the old ones, and are not clamped. A box without a place becomes (-1, -1, -1, -1) in XYXY.
     * `Camera`, the camera of the images, becomes that of the new image. Edits, and `Compose` of edits, need none.
 
     Plain tensors and arrays move by the name of their key, as in `Augmentation`: "gaze", "depth" and so on. An array of
@@ -109,12 +106,7 @@ class Transform(FrontEnd, v2.Transform):
         kinds = {keys[i]: kind or KEEP for i, (kind, _, _) in fields.items()}
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
         sample = Frames({keys[i]: value for i, (_, value, _) in fields.items()}, camera=detached(camera))
-        # a rotated box has a flag for each of its points, and is valid if one of them is
-        of_points = {f"{keys[i]}_valid" for i, (k, v, _) in fields.items() if k == _TURNED and v.shape[-2] == _STEPS**2}
-        for key in of_points & sample.keys():
-            sample[key] = torch.as_tensor(sample[key])[..., None].repeat_interleave(_STEPS**2, -1)
         moved, change = own._augmented(sample, kinds)
-        moved |= {key: moved[key].any(-1) for key in of_points}
         for i, (kind, _, back) in fields.items():
             if change.parts[0].moves is not None or not kind or type(leaves[i]) in _HELD:
                 leaves[i] = back(moved[keys[i]], change)
@@ -172,27 +164,26 @@ def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Ca
         return kind, value, lambda new, change: new if isinstance(leaf, Tensor) else np.asarray(new)
     lacking, form, canvas = KINDS[kind].dims - leaf.ndim, getattr(leaf, "format", None), hasattr(leaf, "canvas_size")
     value, whole, edge = leaf.as_subclass(Tensor)[(None,) * lacking], not leaf.is_floating_point(), 0.5 if form else 0.0
-    turns = form is not None and value.shape[-1] > 4
+    if form is not None and value.shape[-1] > 4:
+        raise ValueError(
+            f"{_OWNER}: {name} must be boxes without rotation; got BoundingBoxes of the format {form.value}. To move "
+            "them, pass their corners as keypoints"
+        )
     if canvas:
         value = value if value.dtype == torch.float64 else value.float()
         if form is not None:
-            ends = tv_tensors.BoundingBoxFormat["XYXYXYXY" if turns else "XYXY"]
-            value = v2.functional.convert_bounding_box_format(value, form, ends)
-            value = value.trunc() if whole and not turns else value  # as torchvision reads whole numbers
+            value = v2.functional.convert_bounding_box_format(value, form, tv_tensors.BoundingBoxFormat.XYXY)
+            value = value.trunc() if whole else value  # as torchvision reads whole numbers
         value = torch.where((value == -1).all(-1, keepdim=True), torch.nan, value - edge)
-    if turns:
-        kind, value = _TURNED, lattice_of(value.unflatten(-1, (4, 2)), _STEPS)
 
     def back(new: Tensor, change: Change) -> Any:
-        if turns:
-            new = turned(new, change.mirrored is not None).flatten(-2)
         if canvas:
             new = torch.where(((new == -1) | new.isnan()).all(-1, keepdim=True), -1.0, new + edge)
         if form is not None:
-            if whole and not turns:  # rounding errors are no reason for another pixel
+            if whole:  # rounding errors are no reason for another pixel
                 low, high = (new[..., :2] + 1e-3).floor(), (new[..., 2:] - 1e-3).ceil()
                 new = torch.cat((low, high + (high - low) % 2 if form.value == "CXCYWH" else high), -1)
-            new = v2.functional.convert_bounding_box_format(new, ends, form)
+            new = v2.functional.convert_bounding_box_format(new, tv_tensors.BoundingBoxFormat.XYXY, form)
         new = (new.round() if whole and canvas else new)[(0,) * lacking]
         size = {"canvas_size": change.parts[0].image_size} if canvas else {}
         return tv_tensors.wrap(new.to(leaf.dtype), like=leaf, **size) if isinstance(leaf, tv_tensors.TVTensor) else new

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -53,28 +51,6 @@ def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
         low = torch.minimum(low, torch.where(inside, lattice, torch.inf).amin(-2))
         high = torch.maximum(high, torch.where(inside, lattice, -torch.inf).amax(-2))
     return torch.where(some.unsqueeze(-1), torch.cat((low, high), -1), -1.0), valid
-
-
-def lattice_of(corners: Tensor, steps: int) -> Tensor:
-    """Return points (..., steps * steps, 2) all over quadrilaterals (..., 4, 2), row by row from the first edge."""
-    share = torch.linspace(0, 1, steps, dtype=corners.dtype, device=corners.device)[:, None]
-    one, two, three, four = corners.unsqueeze(-2).unbind(-3)
-    left, right = (one + (four - one) * share).unsqueeze(-2), (two + (three - two) * share).unsqueeze(-2)
-    return (left + (right - left) * share).flatten(-3, -2)
-
-
-def turned(lattice: Tensor, mirrored: bool = False) -> Tensor:
-    """Return rectangles (..., 4, 2) along the middle rows of moved lattices, which a mirror turns; -1 for none."""
-    steps = math.isqrt(lattice.shape[-2])
-    middle = lattice.unflatten(-2, (steps, steps))[..., steps // 2, steps // 2 - 1 : steps // 2 + 2, :]
-    found, known = (lattice != -1).any(-1), (middle != -1).any(-1)[..., [0, 2]].all(-1)
-    ahead = (middle[..., 0, :] - middle[..., 2, :]) * (1 if mirrored else -1)
-    ahead = torch.where(known.unsqueeze(-1) & (ahead != 0).any(-1, keepdim=True), ahead, ahead.new_tensor((1.0, 0.0)))
-    ahead = ahead / ahead.norm(dim=-1, keepdim=True)
-    axes = torch.stack((ahead, torch.stack((-ahead[..., 1], ahead[..., 0]), -1)), -1)
-    local, found = lattice @ axes, found.unsqueeze(-1)
-    low, high = torch.where(found, local, torch.inf).amin(-2), torch.where(found, local, -torch.inf).amax(-2)
-    return torch.where(found.any(-2, keepdim=True), corners_of(torch.cat((low, high), -1)) @ axes.mT, -1.0)
 
 
 def _inside(warp: CameraPair, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -215,41 +215,12 @@ def test_what_has_no_place_keeps_its_row(vision):
     assert (none.shape, masks.shape) == ((0, 4), (0, *SIZE))
 
 
-@pytest.mark.parametrize("form", ["CXCYWHR", "XYWHR", "XYXYXYXY"])
-def test_rotated_boxes_turn_with_their_axis(form, monkeypatch):
-    with torchvision_of("real", monkeypatch) as tv:
-        front_end = importlib.import_module("camtorch.augment.torchvision")
-        functional = importlib.import_module("torchvision.transforms.v2.functional")
-        formats = tv.BoundingBoxFormat
-
-        def corners(boxes):
-            return functional.convert_bounding_box_format(boxes, None, formats.XYXYXYXY).as_subclass(torch.Tensor)
-
-        given = torch.tensor([[16.0, 12.0, 8.0, 4.0, 30.0], [20.0, 9.0, 6.0, 5.0, -100.0], [9e3, 9.0, 6.0, 5.0, 0.0]])
-        given = functional.convert_bounding_box_format(given, formats.CXCYWHR, formats[form])
-        boxes = tv.BoundingBoxes(given, format=formats[form], canvas_size=SIZE)
-        for augment, flip in ((ct.augment.HorizontalFlip, "horizontal"), (ct.augment.VerticalFlip, "vertical")):
-            want = getattr(functional, f"{flip}_flip")(boxes)  # as torchvision itself does it
-            moved = front_end.Transform(augment(p=1))(boxes)
-            torch.testing.assert_close(corners(moved)[:2], corners(want)[:2], rtol=0, atol=1e-4)
-        mount = ct.augment.RandomMount(yaw=15, roll=(40, 40), min_filled=0)
-        transform = front_end.Transform(mount, camera(), valid=True)
-        out = transform({"boxes": boxes, "boxes_valid": torch.tensor([1, 0, 1])})
-        assert out["boxes_valid"].tolist() == [True, False, False]
-        ends = corners(out["boxes"])[:2].unflatten(-1, (4, 2))
-        inside = transform.last.points(corners(boxes)[None, :2].unflatten(-1, (4, 2)) - 0.5)[0][0] + 0.5 - ends[:, :1]
-        across, down = (ends[:, i] - ends[:, 0] for i in (1, 3))
-        assert (across * down).sum(-1).abs().max() < 1e-3
-        for side in (across, down):  # the corners lie in it, on its sides but for the bending of the lens
-            share = (inside * side[:, None]).sum(-1) / (side**2).sum(-1, keepdim=True)
-            assert -1e-5 < share.min() < 0.2
-            assert 0.8 < share.max() < 1 + 1e-5
-
-
 def test_what_would_not_move_or_be_misread_is_refused(vision):
     front_end, tv = vision
     image = torch.zeros(3, *SIZE)
     boxes = tv.BoundingBoxes(torch.tensor([[2.0, 3, 9, 8]]), format=tv.BoundingBoxFormat.XYWH, canvas_size=SIZE)
+    formats = {tv.BoundingBoxFormat[name]: count for name, count in (("XYWHR", 5), ("CXCYWHR", 5), ("XYXYXYXY", 8))}
+    turned = [tv.BoundingBoxes(torch.ones(2, count), format=f, canvas_size=SIZE) for f, count in formats.items()]
     transform = front_end.Transform(augmentation(), camera())
     two = front_end.Transform(augmentation(), ct.Pinhole(torch.ones(2, 4), image_size=SIZE))
     size = r"KeyPoints must be of the camera's image_size \(24, 32\); got \(5, 6\) \(height, width\)"
@@ -266,6 +237,7 @@ def test_what_would_not_move_or_be_misread_is_refused(vision):
         (two, image, r"batch dims \(2,\)"),
         (front_end.Transform, ct.augment.FaceNormalizer(), "got FaceNormalizer"),
         (augmentation(camera=camera()), {"image": image, "boxes": boxes}, "boxes must be x1, y1, x2, y2; got .*XYWH"),
+        *((transform, {"box": one}, f"format {one.format.value}.*, pass their corners as keypoints") for one in turned),
     ):
         with pytest.raises((TypeError, ValueError), match=text):
             call(sample)
