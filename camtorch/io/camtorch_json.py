@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import torch
@@ -88,21 +88,17 @@ def _camera(record: Record) -> Camera:
     key = record["model"].text()
     names = [name.text() for name in record["distortion_names"]] if "distortion_names" in record else []
     kind = record["model"].model(key)
-    arguments = [_tensor(record["intrinsics"], 4)]
+    intrinsics = _tensor(record["intrinsics"], 4)
     if names and list(kind.names_of(len(names)) or ()) != names:
         record["distortion_names"].fail(f"must be names of {kind.__name__}, {kind.counts_text()}; got {names!r:.60}")
-    if names or "distortion" in record:
-        arguments.append(_tensor(record["distortion"], len(names)))
+    distortion = _tensor(record["distortion"], len(names)) if names or "distortion" in record else intrinsics[..., :0]
     size = None
     if "image_size" in record:
         record["image_size"].numbers(2)
         height, width = (side.side() for side in record["image_size"])
         size = (height, width)
-    _same_batch(record, *arguments)
-    try:
-        return kind(nn.Parameter(arguments[0]), *arguments[1:], image_size=size)  # crops may be off centre
-    except (ValueError, TypeError) as error:
-        return record.fail(error)
+    _same_batch(record, intrinsics, distortion)
+    return record.camera(key, intrinsics, distortion, size)
 
 
 def _same_batch(record: Record, *tensors: Tensor) -> None:
@@ -149,16 +145,10 @@ def _entry(one: Camera | Extrinsics, lossy: Lossy, name: str) -> dict[str, Any]:
     batch = broadcast_shapes(*(t.shape[:-1] for t in tensors))
     first, second = (t if t.ndim == 1 else t.expand(*batch, -1) for t in tensors)
     if isinstance(one, Extrinsics):
-        return {"rotation": _values(lossy, name, first), "translation": _values(lossy, name, second)}
-    entry: dict[str, Any] = {"model": one.key, "intrinsics": _values(lossy, name, first)}
+        return {"rotation": lossy.numbers(name, first), "translation": lossy.numbers(name, second)}
+    entry: dict[str, Any] = {"model": one.key, "intrinsics": lossy.numbers(name, first)}
     if second.shape[-1]:
-        entry |= {"distortion_names": list(one.distortion_names), "distortion": _values(lossy, name, second)}
+        entry |= {"distortion_names": list(one.distortion_names), "distortion": lossy.numbers(name, second)}
     if one.image_size is not None:
         entry["image_size"] = list(one.image_size)
     return entry
-
-
-def _values(lossy: Lossy, name: str, tensor: Tensor) -> Sequence[Any]:
-    if not bool(torch.isfinite(tensor).all()):
-        lossy.fail(name, "numbers must be finite; got NaN or infinity")
-    return tensor.detach().double().tolist()

@@ -246,14 +246,22 @@ def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
     if not all(0 <= i <= _LARGEST_ID for i in ids):
         ids = list(range(1, len(ids) + 1))
     identities = dict(zip(rig.cameras, ids, strict=True))
-    entries = []
+    blocks = [struct.pack("<Q", len(ids))]
+    lines = [
+        "# Camera list with one line of data per camera:",
+        "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
+        f"# Number of cameras: {len(ids)}",
+    ]
     for name, camera in rig.cameras.items():
         height, width = lossy.size(name, camera)
-        entries.append((identities[name], *_smallest(lossy, name, camera), width, height))
+        model, values = _smallest(lossy, name, camera)
+        layout = f"<IiQQ{len(values)}d"
+        blocks.append(struct.pack(layout, identities[name], _MODELS[model][0], width, height, *values))
+        lines.append(f"{identities[name]} {model} {width} {height} {' '.join(map(number, values))}")
     if not (path := lossy.path).endswith(NAMES.suffixes):  # a folder that does not exist yet
         path = os.path.join(path, "cameras.txt")
     binary = path.endswith(".bin")
-    contents = {path: _cameras_content(entries, binary)}
+    contents = {path: b"".join(blocks) if binary else _text_of(lines)}
     beside = _images_beside(path)
     suffix = os.path.splitext(path)[1]
     if rig.extrinsics:
@@ -290,20 +298,7 @@ def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]
     return model, [*(fx, fy)[: _MODELS[model][2]], cx + 0.5, cy + 0.5, *values]
 
 
-def _cameras_content(entries: list[tuple[Any, ...]], binary: bool) -> bytes:
-    if binary:
-        parts = [struct.pack("<Q", len(entries))]
-        for identity, model, values, width, height in entries:
-            parts.append(struct.pack("<IiQQ", identity, _MODELS[model][0], width, height))
-            parts.append(struct.pack(f"<{len(values)}d", *values))
-        return b"".join(parts)
-    lines = [
-        "# Camera list with one line of data per camera:",
-        "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
-        f"# Number of cameras: {len(entries)}",
-    ]
-    for identity, model, values, width, height in entries:
-        lines.append(f"{identity} {model} {width} {height} {' '.join(map(number, values))}")
+def _text_of(lines: list[str]) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
@@ -322,10 +317,10 @@ def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: st
         if os.path.exists(os.path.join(folder, name + suffix)):
             lossy.fail("extrinsics", f"must agree with {name}{suffix} there; got others. Write to another folder")
     if binary:
-        parts = [struct.pack("<Q", len(entries))]
-        for i, (name, camera, values) in enumerate(entries, 1):
-            parts += [_HEAD.pack(i, *values, camera), name.encode(), b"\0", struct.pack("<Q", 0)]
-        return b"".join(parts)
+        blocks = [
+            _HEAD.pack(i, *row, camera) + name.encode() + bytes(9) for i, (name, camera, row) in enumerate(entries, 1)
+        ]
+        return struct.pack("<Q", len(blocks)) + b"".join(blocks)  # names end with a zero byte; no points
     lines = [
         "# Image list with two lines of data per image:",
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
@@ -334,4 +329,4 @@ def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: st
     ]
     for i, (name, camera, values) in enumerate(entries, 1):
         lines += [f"{i} {' '.join(map(number, values))} {camera} {name}", ""]
-    return ("\n".join(lines) + "\n").encode()
+    return _text_of(lines)

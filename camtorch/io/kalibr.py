@@ -79,7 +79,7 @@ def _pose(record: Record, undo: bool = False) -> Extrinsics:
 
 def render(rig: Rig, lossy: Lossy) -> str:
     """Return the text of a file; the cameras are renamed to cam0, cam1, ... in their order."""
-    lossy.no_images(rig := lossy.numbered(rig))
+    rig = lossy.numbered(rig)
     posed = lossy.all_posed(rig) if rig.extrinsics or len(rig.cameras) > 1 else {}
     first = next(iter(posed.values()), None)
     chained = first is None or (len(posed) > 1 and poses.is_identity(first))
@@ -92,24 +92,20 @@ def render(rig: Rig, lossy: Lossy) -> str:
         if previous is not None:
             lines += _rows("T_cn_cnm1", poses.matrices(posed[name]) @ poses.matrices(previous, undo=True))
         previous = posed.get(name)
-        lines += _entries(lossy, name, camera, i)
+        height, width = lossy.size(name, camera)
+        key, intrinsics, distortion = lossy.model(name, camera, {key for key, _, _ in _MODELS.values()})
+        names, before, after = next((names, b, a) for names, (k, b, a) in _MODELS.items() if k == key)
+        distortion = lossy.at_most(name, camera, distortion, (before + after,))
+        lines += [
+            f"  camera_model: {names[0]}",
+            f"  distortion_model: {names[1]}",
+            f"  intrinsics: {listed([*distortion[:before], *intrinsics])}",
+            f"  distortion_coeffs: {listed(distortion[before:])}",
+            f"  resolution: [{width}, {height}]",
+            "  cam_overlaps: []",
+            f"  rostopic: /cam{i}/image_raw",
+        ]
     return "\n".join(lines) + "\n"
-
-
-def _entries(lossy: Lossy, name: str, camera: Camera, index: int) -> list[str]:
-    height, width = lossy.size(name, camera)
-    key, intrinsics, distortion = lossy.model(name, camera, {key for key, _, _ in _MODELS.values()})
-    names, before, after = next((names, b, a) for names, (k, b, a) in _MODELS.items() if k == key)
-    distortion = lossy.at_most(name, camera, distortion, (before + after,))
-    return [
-        f"  camera_model: {names[0]}",
-        f"  distortion_model: {names[1]}",
-        f"  intrinsics: {listed([*distortion[:before], *intrinsics])}",
-        f"  distortion_coeffs: {listed(distortion[before:])}",
-        f"  resolution: [{width}, {height}]",
-        "  cam_overlaps: []",
-        f"  rostopic: /cam{index}/image_raw",
-    ]
 
 
 def _rows(key: str, matrix: Tensor) -> list[str]:

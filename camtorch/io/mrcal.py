@@ -34,10 +34,18 @@ def matches(keys: dict[str, Any]) -> bool:
 def parse(record: Record) -> Rig:
     """Return the camera; the rig is mrcal's reference. The valid region and the optimization inputs are not read."""
     name = record["lens_model" if "lens_model" in record else "lensmodel"]
-    if (found := _splined(name) or _MODELS.get(name.text())) is None:
+    if found := _SPLINED.fullmatch(name.text()):
+        order, columns, rows, fov_x = map(int, found.groups())
+        try:
+            model = Splined.with_grid(order=order, columns=columns, rows=rows, fov_x=fov_x)
+        except ValueError as error:
+            name.fail(error)
+        key, count = model.key, model.default_count
+    elif name.text() in _MODELS:
+        key, count = _MODELS[name.text()]
+    else:
         known = ", ".join(sorted([*_MODELS, _SPLINED_NAME.format(3, 16, 11, 120)]))
         name.fail(f"must be one of {known}; got {name.text()!r:.60}. {LEFT}")
-    key, count = found
     values = record["intrinsics"].numbers(4 + count)
     camera = record["intrinsics"].camera(key, values[:4], values[4:], record["imagersize"].size())
     place = record.get("rt_cam_ref" if "rt_cam_ref" in record else "extrinsics")
@@ -45,18 +53,6 @@ def parse(record: Record) -> Rig:
         return Rig({"camera": camera})
     rt = place.numbers(6)
     return Rig({"camera": camera}, {"camera": poses.pose(place, rt[:3], rt[3:])})
-
-
-def _splined(name: Record) -> tuple[str, int] | None:
-    """Return the key and number of coefficients of a splined lens, or None for another lens."""
-    if (found := _SPLINED.fullmatch(name.text())) is None:
-        return None
-    order, columns, rows, fov_x = map(int, found.groups())
-    try:
-        model = Splined.with_grid(order=order, columns=columns, rows=rows, fov_x=fov_x)
-    except ValueError as error:
-        name.fail(error)
-    return model.key, model.default_count
 
 
 def render(rig: Rig, lossy: Lossy) -> str:

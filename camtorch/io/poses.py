@@ -68,7 +68,9 @@ def from_matrices(place: Place, rows: Any, undo: bool = False) -> Extrinsics:
 
 def rows_of(record: Record) -> list[list[float]]:
     """Return a 4 x 4 or 3 x 4 matrix of a pose as 4 x 4."""
-    rows = record.rows(4 if len(record) == 4 else 3, 4)
+    if len(record) not in (3, 4):
+        record.fail(f"must have 3 rows; got {len(record)}")
+    rows = [row.numbers(4) for row in record]
     if rows[3:] and rows[3] != [0, 0, 0, 1]:
         record.fail(f"the last row must be 0 0 0 1; got {rows[3]}")
     return [*rows[:3], [0.0, 0.0, 0.0, 1.0]]
@@ -102,9 +104,9 @@ def quaternions(extrinsics: Extrinsics, undo: bool = False) -> Tensor:
     return torch.cat((vector_quaternion(there.rotation), there.translation), -1) + 0.0
 
 
-def is_identity(extrinsics: Extrinsics | None) -> bool:
-    """Whether the pose is exactly the identity, or None."""
-    return extrinsics is None or not bool(extrinsics.rotation.any() or extrinsics.translation.any())
+def is_identity(extrinsics: Extrinsics) -> bool:
+    """Whether the pose is exactly the identity."""
+    return not bool(extrinsics.rotation.any() or extrinsics.translation.any())
 
 
 def all_of(rig: Rig, lossy: Lossy) -> Extrinsics:

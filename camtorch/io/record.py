@@ -12,7 +12,7 @@ from itertools import islice
 from typing import Any, NoReturn
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from camtorch.cameras.camera import Camera, as_model
 from camtorch.models import MODELS
@@ -147,12 +147,6 @@ class Record:
         plain = isinstance(self.value, list) and all(type(v) is float and math.isfinite(v) for v in self.value)
         return list(self.value) if plain else [item.number() for item in self]
 
-    def rows(self, rows: int, columns: int) -> list[list[float]]:
-        """Return a list of lists of finite numbers."""
-        if len(self) != rows:
-            self.fail(f"must have {rows} rows; got {len(self)}")
-        return [row.numbers(columns) for row in self]
-
     def flat(self) -> list[float]:
         """Return the numbers of a list, of a list of rows, or of a matrix of OpenCV or ROS."""
         if isinstance(self.value, dict):
@@ -174,21 +168,19 @@ class Record:
     def camera(
         self,
         key: str,
-        intrinsics: list[float],
-        distortion: list[float],
+        intrinsics: list[float] | Tensor,
+        distortion: list[float] | Tensor,
         size: tuple[int, int] | None,
         lens: Record | None = None,
     ) -> Camera:
         """Return the camera of a model of `camtorch.MODELS`, in float64; `lens` is the place of its distortion."""
         kind = self.model(key)
-        arguments = [torch.tensor(intrinsics, dtype=torch.float64)]
-        if distortion:
-            if not kind.names_of(len(distortion)):
-                there = self if lens is None else lens
-                there.fail(f"{kind.__name__} must have coefficients {kind.counts_text()}; got {len(distortion)}")
-            arguments.append(torch.tensor(distortion, dtype=torch.float64))
+        first, second = (torch.as_tensor(values, dtype=torch.float64) for values in (intrinsics, distortion))
+        if (count := second.shape[-1]) and not kind.names_of(count):
+            there = self if lens is None else lens
+            there.fail(f"{kind.__name__} must have coefficients {kind.counts_text()}; got {count}")
         try:
-            return kind(nn.Parameter(arguments[0]), *arguments[1:], image_size=size)  # crops may be off centre
+            return kind(nn.Parameter(first), *([second] if count else []), image_size=size)  # crops may be off centre
         except (ValueError, TypeError) as error:
             self.fail(error)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
-import math
 import os
 import re
 import secrets
@@ -13,7 +12,7 @@ import stat
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, NoReturn
+from typing import IO, Any, NoReturn
 
 from torch import Tensor
 
@@ -96,20 +95,23 @@ class Lossy:
         self, name: str, camera: Camera, known: Collection[str]
     ) -> tuple[str, tuple[float, float, float, float], list[float]]:
         """Return key, intrinsics and distortion of a single camera, whose model must be a known one."""
-        (fx, fy, cx, cy), distortion = self._single(name, camera, "cameras", camera.intrinsics, camera.distortion)
+        (fx, fy, cx, cy), distortion = self._single(name, camera, "cameras")
         if camera.key not in known:
             others = f"must be one of {', '.join(sorted(known))} for {self.format}"
             self.fail(name, f"the model {others}; got {camera.key}. Write camera.convert(key).camera")
         return camera.key, (fx, fy, cx, cy), distortion
 
-    def _single(self, name: str, owner: Camera | Extrinsics, what: str, *tensors: Tensor) -> list[list[float]]:
-        """Return the finite numbers of a camera or a pose that is no batch."""
+    def _single(self, name: str, owner: Camera | Extrinsics, what: str) -> list[list[float]]:
+        """Return the numbers of a camera or a pose that is no batch."""
         if owner.batch_shape:
             self.fail(name, f"must be single for {self.format}; got a batch of {what} {tuple(owner.batch_shape)}")
-        values: list[list[float]] = [t.detach().double().tolist() for t in tensors]
-        if not all(math.isfinite(v) for vector in values for v in vector):
-            self.fail(name, f"{'numbers' if what == 'cameras' else what} must be finite; got NaN or infinity")
-        return values
+        return [self.numbers(name, getattr(owner, key), what) for key in owner.tensor_names]
+
+    def numbers(self, name: str, tensor: Tensor, what: str = "numbers") -> Any:
+        """Return the numbers of a tensor, which must be finite."""
+        if not bool(tensor.isfinite().all()):
+            self.fail(name, f"{what} must be finite; got NaN or infinity")
+        return tensor.detach().double().tolist()
 
     def at_most(self, name: str, camera: Camera, distortion: list[float], counts: Sequence[int]) -> list[float]:
         """Return the coefficients, padded with zeros or without trailing zeros, so that their number is in `counts`."""
@@ -151,8 +153,8 @@ class Lossy:
 
     def pose(self, name: str, extrinsics: Extrinsics) -> tuple[list[float], list[float]]:
         """Return rotation vector and translation of a single pose."""
-        vectors = self._single(name, extrinsics, "extrinsics", extrinsics.rotation, extrinsics.translation)
-        return vectors[0], vectors[1]
+        rotation, translation = self._single(name, extrinsics, "extrinsics")
+        return rotation, translation
 
     def all_posed(self, rig: Rig) -> dict[str, Extrinsics]:
         """Return a pose for each camera; a single camera without a pose is at the rig's origin."""
