@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -87,12 +87,10 @@ def _one(path: Path, rig: Rig, name: str | None = None) -> Camera:
     return camera
 
 
-def read_for_images(
-    images: Sequence[Path], size_of: Callable[[Path], Size | None], arguments: argparse.Namespace
-) -> Camera:
+def read_for_images(images: Sequence[Path], sizes: Iterable[Size | None], arguments: argparse.Namespace) -> Camera:
     """Read the camera of images by `--camera`, `--lens` or `--guess-fov`, for the first image's size if it has none."""
     path: Path | None = arguments.camera
-    sized = ((image, size) for image in images if (size := size_of(image)))
+    sized = ((image, size) for image, size in zip(images, sizes, strict=True) if size)
     first, size = next(sized, (images[0], None))
     if path is None:
         way = "--camera FILE, its calibration, or --lens NAME. --guess-fov DEGREES guesses"
@@ -100,8 +98,8 @@ def read_for_images(
     is_file = not str(path).startswith((LENS, GUESS))
     camera = read_camera(path, arguments.name, arguments.from_model, None if is_file else size)
     if size is not None:
-        sizes = chain([size], (other for _, other in sized))  # read as far as one fits
-        if camera.image_size is None or all(_unfitting(camera, one, arguments.rescale) for one in sizes):
+        known = chain([size], (other for _, other in sized))  # read as far as one fits
+        if camera.image_size is None or all(_unfitting(camera, one, arguments.rescale) for one in known):
             camera = fitting(camera, path, first, size, arguments.rescale)
     return camera
 

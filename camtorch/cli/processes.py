@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 from camtorch.cli.terminal import reason
 
 Pair: TypeAlias = tuple[Path, Path]  # the source file and the target file
-Work: TypeAlias = Callable[[Path, Path], Any]  # makes a file, whole or not at all, and returns facts about it
+Work: TypeAlias = Callable[[Path, Path], Any]  # makes a file, whole or not at all
 _HOW = "spawn" if sys.platform == "win32" else "forkserver"
 _work: Work
 
@@ -28,7 +28,7 @@ _work: Work
 class Outcome:
     """Outcome of a pair."""
 
-    facts: Any = None
+    found: Any = None  # what the work returned
     failure: str = ""  # reason why no file was made, or empty
     notes: list[str] = field(default_factory=list)
 
@@ -79,18 +79,17 @@ def _begin(pickled: bytes) -> None:
     global _work
     import torch
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles interrupts
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    torch.set_num_threads(1)
-    _work = pickle.loads(pickled)
-
-
-def _end_with_parent() -> None:
-    """End this process if its parent was killed and could not end it."""
     parent = multiprocessing.parent_process()
     assert parent is not None
-    parent.join()
-    os._exit(1)
+
+    def end_with_parent() -> None:  # it may be killed and unable to end its processes
+        parent.join()
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles interrupts
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    torch.set_num_threads(1)
+    _work = pickle.loads(pickled)
 
 
 def _attempt(pair: Pair, work: Work | None = None) -> Outcome:
@@ -100,7 +99,7 @@ def _attempt(pair: Pair, work: Work | None = None) -> Outcome:
         try:
             if work is None:
                 signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # removes the partial file
-            facts = (work or _work)(*pair)
+            found = (work or _work)(*pair)
         except SystemExit:  # after which the executor would continue
             os._exit(1)
         except Exception as error:
@@ -108,4 +107,4 @@ def _attempt(pair: Pair, work: Work | None = None) -> Outcome:
         finally:
             if work is None:
                 signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    return Outcome(facts, notes=list(dict.fromkeys(str(warning.message) for warning in caught)))
+    return Outcome(found, notes=list(dict.fromkeys(str(warning.message) for warning in caught)))

@@ -118,21 +118,22 @@ def _decoded(container: Any, stream: Any, *others: Any) -> Iterator[tuple[Any, A
 def remake(
     source: Path,
     target: Path,
-    warp_of: Callable[[tuple[int, int]], tuple[Warp, dict[str, Any]]],
+    warp_of: Callable[[tuple[int, int]], Warp],
     codec: str | None = None,
     crf: int | None = None,
     done: Callable[[], object] = lambda: None,
-) -> dict[str, Any]:
-    """Write a video of warped frames as a whole or not at all; return facts about the warp, and "frames", their number.
+) -> tuple[tuple[int, int], int]:
+    """Write a video of warped frames as a whole or not at all; return (height, width) of the old ones and their number.
 
     Frames are warped in YUV of eight bits in 4:2:0, as nearly all are stored, which is half the work of RGB.
-    `warp_of` returns the warp for frames of a (height, width) with its facts; `done` is called after each frame.
+    `warp_of` returns the warp for frames of a (height, width); `done` is called after each frame.
     """
+    av = require()
     with _opened(source) as (container, stream):
         first = next((frame for frame, _ in _decoded(container, stream)), None)
     if first is None:
         raise ValueError(f"{source}: must have a readable frame; got none")
-    warp, facts = warp_of((first.height, first.width))
+    warp = warp_of((first.height, first.width))
     black = 0.0 if first.reformat(format="yuv420p").color_range == 2 else 16.0
 
     def still(source: Camera, target: Camera, fill: float) -> Warp:
@@ -144,11 +145,7 @@ def remake(
     target.parent.mkdir(parents=True, exist_ok=True)
     # bitexact: no random identifiers
     options = {"format": WRITTEN[target.suffix.lower()], "options": {"fflags": "+bitexact"}}
-    with (
-        replacing(target) as (file,),
-        _opened(source) as (container, stream),
-        require().open(file, "w", **options) as output,
-    ):
+    with replacing(target) as (file,), _opened(source) as (container, stream), av.open(file, "w", **options) as output:
         new = _new_stream(output, first, _rate(stream), codec, crf, target, warp.target)
         others = [other for other in container.streams if other.type in ("audio", "subtitle")]
         copies = {other.index: _copied_stream(output, other, source, target) for other in others}
@@ -160,7 +157,7 @@ def remake(
                 output.mux(packet)
                 continue
             end = max(end, frame.time + float(1 / _rate(stream)) - begin)
-            old, made = frame.reformat(format="yuv420p"), require().VideoFrame(new.width, new.height, "yuv420p")
+            old, made = frame.reformat(format="yuv420p"), av.VideoFrame(new.width, new.height, "yuv420p")
             for plane, pixels, target_pixels in zip(warps, _planes(old), _planes(made), strict=True):
                 target_pixels[:] = plane(torch.from_numpy(pixels)[None, None])[0, 0].numpy()
             for name in ("pts", "time_base", "duration", *_COLOURS):
@@ -171,7 +168,7 @@ def remake(
         output.mux(new.encode(None))
         if length - end > max(_CUT, 0.02 * length):
             raise ValueError(f"{source}: must last {length:.1f} seconds; got {end:.1f}. It is cut off or damaged")
-    return facts | {"frames": count}
+    return (first.height, first.width), count
 
 
 def _planes(frame: Any) -> list[np.ndarray[Any, Any]]:

@@ -52,11 +52,6 @@ class BuildError(RuntimeError):
     """Raised if there is no C compiler, or if it fails, with its command and output."""
 
 
-def switched_off() -> bool:
-    """Whether the environment has `CAMTORCH_NATIVE=0`."""
-    return os.environ.get("CAMTORCH_NATIVE", "").strip().lower() in ("0", "off", "false")
-
-
 def checksum(sources: str | os.PathLike[str] = _HERE) -> int | None:
     """Return a checksum of the C files in a folder, or None if it has none; a library holds that of its sources."""
     texts = [path.read_bytes() for path in sorted(Path(sources).glob("*.[ch]"))]
@@ -150,12 +145,8 @@ def _compiler() -> list[str]:
     raise BuildError(f"no C compiler: one of {', '.join(names)} must be on the PATH; got none. Install one, or set CC")
 
 
-def _main() -> None:
+if __name__ == "__main__":
     try:
         print(build())
     except (BuildError, OSError) as error:
         sys.exit(f"camtorch.native.build: {error}")
-
-
-if __name__ == "__main__":
-    _main()

@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
-from camtorch.native.build import LIBRARY, REASON, VARIANTS, checksum, switched_off
+from camtorch.native.build import LIBRARY, REASON, VARIANTS, checksum
 
 _HERE = Path(__file__).resolve().parent
 _BUILD = "python -m camtorch.native.build"
@@ -23,7 +23,7 @@ class _Found(NamedTuple):
 
 @functools.cache
 def _find() -> _Found:
-    if switched_off():
+    if os.environ.get("CAMTORCH_NATIVE", "").strip().lower() in ("0", "off", "false"):
         return _Found(None, "off (CAMTORCH_NATIVE=0)")
     path = _HERE / LIBRARY
     if not path.exists():
@@ -34,8 +34,10 @@ def _find() -> _Found:
         library = ctypes.CDLL(str(path))
     except OSError as error:
         return _Found(None, f"not loaded ({error}); `{_BUILD}` builds it again")
-    here = checksum()
-    if here is not None and here != _sources(library):  # None if a package leaves the sources out
+    here, built_from = checksum(), getattr(library, "camtorch_sources", None)
+    if built_from is not None:
+        built_from.restype = ctypes.c_uint32
+    if here is not None and (built_from is None or built_from() != here):  # None if a package leaves the sources out
         why = "not used (built from other sources than those beside it)"
         return _Found(None, f"{why}; `{_BUILD}` or `pip install -e .` builds it again", stale=True)
     wanted = os.environ.get("CAMTORCH_CPU", "").strip().lower()
@@ -44,13 +46,6 @@ def _find() -> _Found:
         raise ValueError(f"CAMTORCH_CPU must be one of {names} on this CPU; got {wanted!r}. Unset it to use the best")
     library.camtorch_variant.restype = ctypes.c_char_p
     return _Found(library, library.camtorch_variant().decode())
-
-
-def _sources(library: ctypes.CDLL) -> int | None:
-    if not hasattr(library, "camtorch_sources"):
-        return None
-    library.camtorch_sources.restype = ctypes.c_uint32
-    return int(library.camtorch_sources())
 
 
 @functools.cache

@@ -48,11 +48,6 @@ def _place(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_form
     return -(-like.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE, like.stride()
 
 
-def release() -> None:
-    """Give kept memory back to the system."""
-    _idle.clear()
-
-
 # There is no lock: a tensor may die wherever Python collects garbage, also within these functions. Each of their
 # changes of the list is atomic. A fork's child has pages of its own.
 _idle: list[mmap.mmap] = []

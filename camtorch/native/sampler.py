@@ -175,20 +175,12 @@ def layout(images: Tensor) -> torch.memory_format:
     return torch.channels_last if last else torch.contiguous_format
 
 
-def empty(images: Tensor, count: int, size: tuple[int, int]) -> Tensor:
-    """Make room (count, C, *size) in the dtype of images (_, C, H, W), and in their layout in memory."""
-    return maker(images, count, size)()
-
-
 def maker(images: Tensor, count: int, size: tuple[int, int]) -> Callable[[], Tensor]:
-    """Return what makes results as of `empty`."""
+    """Return what makes room (count, C, *size) in the dtype of images (_, C, H, W), and in their layout in memory."""
     shape, dtype = (count, images.shape[1], *size), images.dtype
-    make = memory.empty if math.prod(shape) * dtype.itemsize >= memory.LEAST else _empty
-    return functools.partial(make, shape, dtype, layout(images))
-
-
-def _empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> Tensor:
-    return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
+    if math.prod(shape) * dtype.itemsize >= memory.LEAST:
+        return functools.partial(memory.empty, shape, dtype, layout(images))
+    return functools.partial(torch.empty, shape, dtype=dtype, device="cpu", memory_format=layout(images))
 
 
 def classify(

@@ -15,7 +15,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import opaque
 from camtorch.evaluate.door import in_transform, keeps_graph
 from camtorch.evaluate.known import are_known, are_plain, is_unknown
-from camtorch.native.sampler import empty
+from camtorch.native.sampler import maker
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
@@ -143,7 +143,7 @@ class MirrorWarp(Warp):
         count = len(images) if cameras == 1 else cameras
         if not are_plain(images):
             return images.new_empty(count, images.shape[1], *size)
-        return empty(images, count, size)
+        return maker(images, count, size)()
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
         return MirrorWarp(source, target, rotation, **options)

@@ -33,7 +33,7 @@ from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import is_unknown
 from camtorch.native import memory
 from camtorch.native.library import library
-from camtorch.native.sampler import Call, empty, is_quick, maker, packed, takes, tiles_of
+from camtorch.native.sampler import Call, is_quick, maker, packed, takes, tiles_of
 from camtorch.projection.compiled import (
     BOXES,
     LATTICE_WORDS,
@@ -134,7 +134,7 @@ def warped(warp: CameraPair, images: Tensor, sampler: Sampler) -> Tensor:
         return compiled.warped(images, warp._sampled, warp.target, warp.rotation, *options)
     if route == "strips":
         cameras = math.prod(warp.batch_shape)
-        result = empty(images, len(images) if cameras == 1 else cameras, warp.target._size_for("Warp"))
+        result = maker(images, len(images) if cameras == 1 else cameras, warp.target._size_for("Warp"))()
         kept: dict[int, Pyramid] = {}
         for rows, where in strips(warp, sampler.padding_mode):
             with torch.no_grad():
@@ -375,7 +375,7 @@ class SampleForm:
         if not isinstance(how, Sampler):
             return torch.promote_types(value.dtype, self.dtype) == self.dtype
         image = self.images(value)
-        result = empty(image, self.count, self.sizes[1])
+        result = maker(image, self.count, self.sizes[1])()
         return 0 not in result.shape and takes(image.dtype, how.mode) and is_quick(image, result, how.mode)
 
     def maker(self, value: Tensor) -> Callable[[], Tensor]:
@@ -419,7 +419,7 @@ class SampleCall:
             make = None
             if isinstance(how, Sampler):
                 image, make = form.images(value), form.maker(value)
-                result = empty(image, count, sizes[1])
+                result = maker(image, count, sizes[1])()
                 fill = how.fill * image.shape[1] if len(how.fill) == 1 else how.fill
                 place = (0,) * 8 + self._lattices.places
                 words, holds = packed(image, result, how.mode, how.padding_mode, fill, place)

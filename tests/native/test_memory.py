@@ -21,9 +21,9 @@ pytestmark = pytest.mark.skipif(not hasattr(mmap, "MADV_HUGEPAGE"), reason="the 
 
 @pytest.fixture(autouse=True)
 def nothing_kept():
-    memory.release()
+    memory._idle.clear()
     yield
-    memory.release()
+    memory._idle.clear()
 
 
 def made(dtype=torch.float32, shape=SHAPE, layout=torch.contiguous_format):
@@ -60,10 +60,10 @@ def test_memory_is_used_again_when_all_have_let_go_of_it():
         held = hold(tensor)
         del tensor
         assert made().data_ptr() != place, name
-        memory.release()
+        memory._idle.clear()
         del held
         assert made().data_ptr() == place, name
-        memory.release()
+        memory._idle.clear()
 
 
 def test_what_is_kept_has_a_limit():
