@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             status: int = command.run(arguments) or 0
         for warning in caught:
             note(warning.message)
-        sys.stdout.flush()
+        print(end="", flush=True)  # unless stdout is closed
     except BrokenPipeError:  # the reader closed the pipe, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _PIPE

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageCms
 
 import camtorch as ct
 from camtorch.cli.main import main
@@ -11,6 +11,7 @@ from camtorch.cli.main import main
 FILES = Path(__file__).parents[1] / "files"
 FISHEYE = "%YAML:1.0\n---\nimage_width: 96\nimage_height: 64\nfisheye_model: 1\n"
 MATRIX = "K: [28, 0, 47, 0, 28, 32, 0, 0, 1]\nD: [-0.02, 0.004, -0.003, 0.0006]\n"
+PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 LEVEL = "K: [80, 0, 47.5, 0, 80, 31.5, 0, 0, 1]"
 """A pinhole whose dewarped image is the image."""
 

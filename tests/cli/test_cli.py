@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from command_line import FILES, LEVEL, MATRIX, camera, command, opened, pixels, refused
-from PIL import Image, ImageCms
+from command_line import FILES, LEVEL, MATRIX, PROFILE, camera, command, opened, pixels, refused
+from PIL import Image
 
 import camtorch as ct
 from camtorch.boards.finding import IMAGES
@@ -79,8 +79,9 @@ def test_where_the_result_goes(folder, capsys, monkeypatch):
     for name in (folder / "in.png", "link.png", "hard.png", "camera.png"):
         assert "which is read. Name another file" in refused(capsys, *words, name, "--force")
     assert Path("in.png").read_bytes() == image
-    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), "ascii"))  # which lacks a letter
-    command(*words, "späce.png")
+    for stdout in (None, io.TextIOWrapper(io.BytesIO(), "ascii")):  # it is closed, or lacks a letter
+        monkeypatch.setattr(sys, "stdout", stdout)
+        command(*words, "späce.png", "--force")
     assert sys.stdout.buffer.getvalue().startswith(rb"sp\xe4ce.png: kannala_brandt")
 
 
@@ -134,9 +135,6 @@ def test_transparency_by_a_colour_stays(folder, mode, clear):
     out = opened("out.png")
     assert out.mode == ("LA" if mode in "L1" else "RGBA")
     assert [out.getpixel((x, 32))[-1] for x in (10, 80)] == [0, 255]
-
-
-PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 
 
 def tagged(path, orientation, **options):
