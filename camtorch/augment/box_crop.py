@@ -13,7 +13,7 @@ from camtorch.augment.ranges import RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.poses.rotations import mount_rotation
 from camtorch.values.arguments import as_known_size, as_whole
-from camtorch.warp.views import as_margin, check_extents, looking_at, pinhole
+from camtorch.warp.views import as_margin, looking_at, pinhole
 
 
 class BoxCrop(Augmentation):
@@ -70,7 +70,6 @@ class BoxCrop(Augmentation):
         """Return the camera that looks at `values["box"]`, (*B, 4), and its rotation; see `Augmentation.new_camera`."""
         box = values["box"]
         rows = box.reshape(-1, 4)
-        check_extents(rows, source, self._name)
         found = looking_at(source, rows, self.image_size, self.margin, self._name)
         intrinsics, rotation = (t[0] if box.ndim == 1 else t for t in found)
         if "zoom" in values:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 from typing_extensions import Unpack
 
@@ -19,7 +20,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited, quarter_turns
 from camtorch.evaluate.known import known_false, known_true
 from camtorch.values.arguments import as_known_size, as_whole
-from camtorch.warp.affine import AffineWarp, Map, Rows, after, as_tensor, on_rays
+from camtorch.warp.affine import AffineWarp, Map, Rows, after, as_tensor
 
 Size = int | Sequence[int]
 
@@ -119,7 +120,9 @@ def _turn(matrix: Map, source: Camera) -> Tensor | None:
     own, like = as_tensor(matrix), source.intrinsics
     if known_true(own[..., :2].diagonal(dim1=-2, dim2=-1) > 0):
         return None
-    return on_rays(own).to(like.device, torch.promote_types(like.dtype, torch.float32))
+    signs = own[..., :2].sign()  # of a mirror, or a turn about the axis
+    rotation = F.pad(signs, (0, 1, 0, 1)) + signs.new_tensor([0.0, 0.0, 1.0]).diag()
+    return rotation.to(like.device, torch.promote_types(like.dtype, torch.float32))
 
 
 def _map(across: float, left: float, down: float, top: float) -> Rows:

@@ -14,18 +14,15 @@ from torch.utils import _pytree
 from torch.utils._python_dispatch import _disable_current_modes
 from torch.utils.data._utils.collate import collate, default_collate_fn_map
 
-FAKE_MODE = torch._C._TorchDispatchModeKey.FAKE
-"""The key of a FakeTensorMode among the active modes."""
+FAKE_MODE = torch._C._TorchDispatchModeKey.FAKE  # the key of a FakeTensorMode among the active modes
 NO_TORCH_FUNCTION: Any = torch._C._disabled_torch_function_impl
 """The `__torch_function__` of a class of tensors whose operators return plain tensors."""
-pytree = _pytree
-"""Trees, with the paths of their leaves."""
+pytree = _pytree  # trees, with the paths of their leaves
 TORCH_LIBRARY: str = torch._C.__file__
 """The shared library of torch, which has the functions of OpenMP and MKL that it uses."""
 COLLATE_FUNCTIONS: dict[Any, Callable[..., Any]] = default_collate_fn_map
 """The functions of `default_collate` by the types of their parts; it uses those that are added."""
-collate_by: Callable[..., Any] = collate
-"""`default_collate` with other functions, `collate_fn_map`."""
+collate_by: Callable[..., Any] = collate  # `default_collate` with other functions, `collate_fn_map`
 
 _DENSE = torch._C._dispatch_keys(torch.empty(0, device="cpu"))
 _PLAIN: int = _DENSE.raw_repr()

@@ -102,8 +102,7 @@ class Registry(dict[str, Any]):
         return self[name]
 
 
-CLASSES = Registry()
-"""All classes of cameras and of radial factors, by name."""
+CLASSES = Registry()  # all classes of cameras and of radial factors, by name
 
 
 def register(entry: type) -> str:

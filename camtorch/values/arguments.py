@@ -24,8 +24,7 @@ from camtorch.evaluate.known import is_kept, is_predicted, known_false, row_of
 Numbers: TypeAlias = Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]
 """Numbers as users pass them: a tensor, an array, a number, or lists of them."""
 
-LEFT = "docs/leaving-0.3.md lists what left camtorch"
-"""The hint of errors about unknown names."""
+LEFT = "docs/leaving-0.3.md lists what left camtorch"  # the hint of errors about unknown names
 
 Taken = ParamSpec("Taken")
 Result = TypeVar("Result")
@@ -189,11 +188,8 @@ def shown(value: object) -> str:
     return f"{value!r:.60}"
 
 
-MASKED = "its mask would be lost. Pass array.filled(value), and ~array.mask apart"
-"""The reason of errors about masked arrays."""
-
-GUESS_CAMERA = "KannalaBrandt.from_fov(degrees, image_size=...) guesses a camera"
-"""The hint of errors about a missing camera."""
+MASKED = "its mask would be lost. Pass array.filled(value), and ~array.mask apart"  # the reason of errors
+GUESS_CAMERA = "KannalaBrandt.from_fov(degrees, image_size=...) guesses a camera"  # if one is missing
 
 
 def no_camera(value: object) -> str:

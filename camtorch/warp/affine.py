@@ -329,9 +329,3 @@ def after(second: Map, first: Map) -> Map:
     (a, b, left), (c, d, top) = second
     (e, f, x), (g, h, y) = first
     return ((a * e + b * g, a * f + b * h, a * x + b * y + left), (c * e + d * g, c * f + d * h, c * x + d * y + top))
-
-
-def on_rays(matrix: Tensor) -> Tensor:
-    """Return the effect (*B, 3, 3) of maps of pixels on rays, a mirror or a turn about the axis: the maps' signs."""
-    signs = matrix[..., :2].sign()
-    return F.pad(signs, (0, 1, 0, 1)) + signs.new_tensor([0.0, 0.0, 1.0]).diag()

@@ -51,8 +51,7 @@ class Plan:
 class CameraPair(GeometryModule):
     """The state of a `Warp`: source, target, rotation and options; and where target pixels lie."""
 
-    is_an_operator: ClassVar[bool] = True
-    """Whether compiled code calls it as one: the cameras and the rotation are all there is to it."""
+    is_an_operator: ClassVar[bool] = True  # compiled code may call it as one, as cameras and rotation are all of it
     batch_shape: torch.Size
     padding_mode: PaddingMode
     _tolerance: float | None

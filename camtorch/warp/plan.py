@@ -73,8 +73,7 @@ Route = Literal["operator", "strips", "graph", "kept"]
 Label = Literal["pixels", "boxes", "rays", "columns", "pose"]
 """What moves beside images: pixels, boxes, directions and points of the camera frame, or columns of such in a matrix,
 of which those of a pose begin with a rotation."""
-Sizes = tuple[tuple[int, int], tuple[int, int]]
-"""(height, width) of the source's image, and of the target's."""
+Sizes = tuple[tuple[int, int], tuple[int, int]]  # (height, width) of the source's image, and of the target's
 
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
 _STRIP = 1 << 21  # pixels of such a strip

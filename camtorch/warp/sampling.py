@@ -26,8 +26,7 @@ Fill = float | Sequence[float]
 MODES: tuple[Mode, ...] = get_args(Mode)
 PADDINGS: tuple[PaddingMode, ...] = get_args(PaddingMode)
 
-SHRINKS = 1.5
-"""From this many pixels of the image to one of the result on, edits antialias by themselves."""
+SHRINKS = 1.5  # pixels of the image to one of the result, from which on edits antialias by themselves
 SURELY = 0.999  # of that: whatever rounding does, less does not
 _REACH = {"nearest": 1, "bilinear": 1, "bicubic": 2}  # pixels to either side of a position that have a part in it
 _LARGE = 1 << 23  # numbers in an image whose copy in float32 leaves every cache
@@ -116,7 +115,6 @@ def by_torch(
 
 
 def _by_torch(images: Tensor, where: Sampling, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
-    """Sample B images by `grid_sample`."""
     count, dtype = images.shape[0], images.dtype
     wide = dtype == wide_dtype(dtype)
     if how.mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:

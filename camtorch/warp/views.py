@@ -229,7 +229,6 @@ def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin
         raise ValueError(f"{owner}: boxes must be one for each camera of one batch dim; got {len(given)} for {batch}")
     size = as_known_size(image_size, owner)
     rows = given if given.ndim == 2 else given.expand(*(batch or (1,)), 4)
-    check_extents(rows, camera, owner)
     intrinsics, rotation = looking_at(camera, rows, size, as_margin(margin, owner), owner)
     if given.ndim == 1 and not batch:
         intrinsics, rotation = intrinsics[0], rotation[0]
@@ -251,19 +250,6 @@ def pinhole(intrinsics: Tensor, size: tuple[int, int]) -> Pinhole:
     return remade(_VIRTUAL, intrinsics=intrinsics, distortion=intrinsics[..., :0], image_size=size)
 
 
-def check_extents(boxes: Tensor, camera: Camera, owner: str) -> None:
-    """Raise a ValueError unless boxes (B, 4) are finite, have an extent, and are on the camera's image."""
-    check_boxes(boxes, "boxes", owner)
-    limits = boxes.new_tensor((camera.width, camera.height)) - 0.5
-    low, high = boxes.split(2, -1)
-    for wrong, what in (
-        (~torch.isfinite(boxes).all(-1), "be finite"),
-        (~(low < high).all(-1), "have a width and a height: x1 < x2 and y1 < y2"),
-        (~((low < limits) & (high > -0.5)).all(-1), f"be on the image, {camera.width} x {camera.height}, in part"),
-    ):
-        _refuse(wrong, boxes, what, owner)
-
-
 def _refuse(wrong: Tensor, boxes: Tensor, what: str, owner: str) -> None:
     """Raise a ValueError that names the first of `boxes` (B, 4) at which `wrong` (B,) is True, if there is one."""
     if bool(wrong.any()):
@@ -276,6 +262,12 @@ def looking_at(
     camera: Camera, boxes: Tensor, size: tuple[int, int], margin: float, owner: str
 ) -> tuple[Tensor, Tensor]:
     """Return intrinsics (B, 4) and rotations (B, 3, 3), in float64, of the cameras of `look_at` for boxes (B, 4)."""
+    check_boxes(boxes, "boxes", owner)
+    _refuse(~torch.isfinite(boxes).all(-1), boxes, "be finite", owner)
+    _refuse(~(boxes[:, :2] < boxes[:, 2:]).all(-1), boxes, "have a width and a height: x1 < x2 and y1 < y2", owner)
+    limits = boxes.new_tensor((camera.width, camera.height)) - 0.5
+    is_shown = ((boxes[:, :2] < limits) & (boxes[:, 2:] > -0.5)).all(-1)
+    _refuse(~is_shown, boxes, f"be on the image, {camera.width} x {camera.height}, in part", owner)
     low, high = boxes.detach().double().split(2, -1)
     axis, has_ray = camera.unproject((low + high) / 2)
     _refuse(~has_ray, boxes, "have a middle that the lens sees", owner)

@@ -90,8 +90,7 @@ class Warp(CameraPair):
     fill: tuple[float, ...]
     antialias: bool
     _has_shutters: ClassVar[bool] = False
-    keeps_lens: ClassVar[bool] = False
-    """Whether it can follow another warp, as one warp that `follow` returns."""
+    keeps_lens: ClassVar[bool] = False  # True: it can follow another warp, as one warp that `follow` returns
 
     def __init__(
         self,
