@@ -81,7 +81,7 @@ def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: 
             tensor.numpy()[:] = row  # takes half the time of torch.tensor
         made.append(nn.Parameter(tensor) if row else tensor)
         rows.append(row)
-    names = _names_of(model, len(rows[1]))  # type: ignore[arg-type]  # a class can be hashed
+    names = _names_of(model, len(rows[1]))
     if len(rows[0]) != 4 or not min(rows[0][:2]) > 0 or names is None:
         return None
     if size is not None:
@@ -92,9 +92,7 @@ def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: 
     return made[0], made[1], names, _NO_BATCH, size
 
 
-@functools.lru_cache(maxsize=256)
-def _names_of(model: type[CameraLike], count: int) -> tuple[str, ...] | None:
-    return model.names_of(count)
+_names_of = functools.lru_cache(maxsize=256)(lambda model, count: model.names_of(count))
 
 
 def checked_intrinsics(model: type[CameraLike], intrinsics: Numbers) -> Tensor:

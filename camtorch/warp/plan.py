@@ -229,11 +229,9 @@ def on_image(warp: CameraPair, where: Sampling | Lattice) -> Tensor:
 
 def pin(warp: CameraPair) -> None:
     """Have a warp keep its positions from now on, with their graph, if they are to be kept at all."""
-    # what a transform makes dies with it; what inference mode makes could not be used in a graph later; the operator
-    # of compiled code keeps its own
-    if _is_operator(warp) and compiled.takes(warp.target.intrinsics.detach(), warp._inputs()):
-        return
-    if torch.is_inference_mode_enabled():
+    # the operator of compiled code keeps its own; what inference mode makes could not be used in a graph later
+    is_operator = _is_operator(warp) and compiled.takes(warp.target.intrinsics.detach(), warp._inputs())
+    if warp.is_pinned or is_operator or torch.is_inference_mode_enabled():
         return
     if keeps_graph(*warp._inputs()):
         where = positions(warp, "graph")

@@ -242,8 +242,7 @@ class Warp(CameraPair):
 
     def pin(self) -> Warp:
         """Compute the grid once, with its graph, for a warp whose cameras will not change; return the warp."""
-        if not self.is_pinned:
-            plan.pin(self)
+        plan.pin(self)
         return self
 
     def transform_points(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
