@@ -287,8 +287,7 @@ class Augmentation(SampleTransform):
         if self.min_filled:
             factor, turned, found = enough(source, target, rotation, self.min_filled)
             target, rotation = scaled(target, factor), None if rotation is None else turned
-            self._tell_of_too_few(found, self.min_filled)
-            self._tell_of_zoom(source, target, factor, found)
+            self._tell_of(source, lambda: target, factor, found)
         return self._between(rows, source, values, target, rotation)
 
     def _between(
@@ -325,8 +324,9 @@ class Augmentation(SampleTransform):
         """Return `shades` and `light` of a part: the effect of its lens on colours and light."""
         return None, None
 
-    def _tell_of_too_few(self, found: Tensor, share: float) -> None:
-        """Warn, once, if less than a share of some images was found filled."""
+    def _tell_of(self, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor) -> None:
+        """Warn, once, if filled parts (*B,) are less than `min_filled` with these factors (*B,) on focal lengths."""
+        share = self.min_filled or 0.0
         if self._warned or not known_false(found >= share):
             return
         self._warned, few = True, int((found < share).sum())
@@ -335,9 +335,6 @@ class Augmentation(SampleTransform):
             f"down to {float(found.min()):.0%} shows something: the camera of the images does not see along the axis "
             "of the new one. Turn it less, or use less of min_filled"
         )
-
-    def _tell_of_zoom(self, source: Camera, target: Camera, factor: Tensor, found: Tensor) -> None:
-        """Warn of a zoom by `min_filled`, of factors (*B,) on the focal lengths and filled parts (*B,)."""
 
     def tell_of_empty_images(self, camera: Camera) -> None:
         """Warn, once, if new images of such cameras will be mostly empty, as some draws apart from all others say."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple, cast
@@ -222,18 +222,12 @@ class CameraDrawer(Augmentation):
         if made is None:
             return super()._part(rows, source, draw)
         if self.min_filled:
-            self._tell_of(source, made)
+            self._tell_of(source, lambda: made.target, made.factor, made.found)
         simple = self.options["tolerance"] and not self.options["antialias"] and made.native is not None
         simple = simple and self.beside_the_camera.isdisjoint(self.ranges)
         if simple and not isinstance(source, PANORAMAS) and not isinstance(made.base, PANORAMAS):
             return Part(rows, made, source)
         return self._between(rows, source, values, made.target, made.rotation)
-
-    def _tell_of(self, source: Camera, made: Drawn) -> None:
-        """Warn, once each, of what `min_filled` cannot fill, or makes of a field of view."""
-        self._tell_of_too_few(made.found, self.min_filled or 0.0)
-        if bool((made.factor > 1).any()):
-            self._tell_of_zoom(source, made.target, made.factor, made.found)
 
     def _prepare(self, sample: Sample, batch: Batch, change: Change) -> None:
         form, moves = batch.form, change.parts[0].moves
@@ -302,7 +296,8 @@ class CameraDrawer(Augmentation):
         if self.min_filled or ready.rest:
             change = cast("Change", self.last)
             if self.min_filled:
-                self._tell_of(change.parts[0].camera, cast("Drawn", change.parts[0].moves))
+                made = cast("Drawn", change.parts[0].moves)
+                self._tell_of(change.parts[0].camera, lambda: made.target, made.factor, made.found)
             for name, found in ready.rest:
                 value, valid = self._one(change, found, sample[name][None], {"mask_fill": self.mask_fill})
                 result[name] = value.squeeze(0)
@@ -337,15 +332,17 @@ class CameraDrawer(Augmentation):
             light = natural if light is None else light * natural
         return shades, light
 
-    def _tell_of_zoom(self, source: Camera, target: Camera, factor: Tensor, found: Tensor) -> None:
-        """Warn, once a process, if `min_filled`, and not a draw, zoomed to less than the `fov` that was asked for."""
+    def _tell_of(self, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor) -> None:
+        """Warn also, once a process, if `min_filled`, and not a draw, zoomed to less than the `fov` asked for."""
+        super()._tell_of(source, target, factor, found)
         asked = self._among[0] if self._among else self.ranges["fov"].low if "fov" in self.ranges else None
         share = self.min_filled or 0.0
         key = self._name, asked, share
         if asked is None or key in _told or not known_false(factor <= 1):
             return
-        made = _across(target)
-        least = torch.minimum(_across(scaled(target, 1 / factor)), torch.full_like(made, asked))
+        zoomed = target()
+        made = _across(zoomed)
+        least = torch.minimum(_across(scaled(zoomed, 1 / factor)), torch.full_like(made, asked))
         # what cannot be filled at all has a warning of its own
         less = (made < _LESS * least) & (factor > 1) & (found >= share)
         if not bool(less.any()):

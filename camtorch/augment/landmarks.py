@@ -126,10 +126,6 @@ _LEFT, _RIGHT = "_left", "_right"
 class Mirroring:
     """Effects of a mirror on more than places and directions: on landmarks, names of fields, and sides of heads."""
 
-    lateral: int  # the number of the lateral axis
-    by_name: tuple[str, ...]  # the fields whose tables are given by name
-    key: object  # equal for equal effects
-
     def __init__(
         self,
         landmarks: TableLike | Mapping[str, TableLike | None] | None,
@@ -141,7 +137,7 @@ class Mirroring:
             raise ValueError(
                 f"{owner}: lateral_axis must be 'x', 'y' or 'z', of the head's frame; got {shown(lateral_axis)}"
             )
-        self.lateral = "xyz".index(lateral_axis)
+        self.lateral = "xyz".index(lateral_axis)  # the number of the head's axis from side to side
         self.owner = owner
         self.swap_sides: bool = as_flag(swap_sides, "swap_sides", owner)
         self._named: dict[str, Table | None] | None = None
@@ -150,8 +146,8 @@ class Mirroring:
             self._named = {name: None if t is None else as_table(t, owner) for name, t in landmarks.items()}
         elif landmarks is not None:
             self._one = as_table(landmarks, owner)
-        self.by_name = tuple(self._named or ())
-        self.key = self._named, self._one, self.lateral, self.swap_sides
+        self.by_name = tuple(self._named or ())  # the fields whose tables are given by name
+        self.key = self._named, self._one, self.lateral, self.swap_sides  # equal for equal effects
 
     def order(self, name: str, kind: str | None, count: int) -> tuple[int, ...] | None:
         """Return the order of `count` landmarks of a field in a mirror, or None; a path may precede its name."""

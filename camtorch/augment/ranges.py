@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from camtorch.evaluate.known import are_free
@@ -85,15 +84,11 @@ def as_range(
 class Spans:
     """Ranges, ready to draw a value of each for some samples."""
 
-    low: NDArray[np.float64]
-    wide: NDArray[np.float64]
-    _places: list[tuple[str, slice, tuple[int, int] | None]]
-    _ends: list[tuple[float, float]]
-
     def __init__(self, ranges: Mapping[str, Range], rows: int):
         self.ranges: dict[str, Range] = dict(ranges)
         self.rows = rows
-        self._places, self._ends = [], []
+        self._places: list[tuple[str, slice, tuple[int, int] | None]] = []
+        self._ends: list[tuple[float, float]] = []
         for name, interval in ranges.items():
             start, shape = len(self._ends), (rows, interval.size) if interval.size else None
             self._ends += [(interval.low, interval.high - interval.low)] * (rows * (interval.size or 1))

@@ -30,8 +30,6 @@ _ENDINGS = ("jpg", "jpeg", "png", "webp", "ppm", "pgm", "tif", "tiff", "bmp", "n
 class Always(Augmentation):
     """A single warp that is applied to every sample."""
 
-    warp: Warp
-
     def __init__(self, warp: Warp, owner: str, fields: Mapping[str, str] | None = None):
         if isinstance(warp, ProxyWarp):
             raise TypeError(f"{owner}: warp must move labels too; got {type(warp).__name__}. Call it on images alone")
