@@ -81,7 +81,7 @@ def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: 
             tensor.numpy()[:] = row  # takes half the time of torch.tensor
         made.append(nn.Parameter(tensor) if row else tensor)
         rows.append(row)
-    names = _names_of(model, len(rows[1]))
+    names = _names_of(model, len(rows[1]))  # type: ignore[arg-type]  # a class can be hashed
     if len(rows[0]) != 4 or not min(rows[0][:2]) > 0 or names is None:
         return None
     if size is not None:

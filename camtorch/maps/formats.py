@@ -27,8 +27,6 @@ _ALL = OpenCV("opencv"), OpenCV("opencv_fixed"), DW100(), TILDC(), ONNX()  # in 
 _FORMATS: dict[str, MapFormat] = {format.name: format for format in _ALL}
 FORMATS = tuple(_FORMATS)
 
-_LARGEST_FILE = 1 << 31
-_LARGEST_DESCRIPTION = 1 << 16
 _NO_FACTS = ("format", *SIZES, "max_error", "rms_error")
 _KNOWN = f"known are {', '.join(FORMATS)}; docs/leaving-0.3.md lists what to use for formats that left"
 
@@ -106,7 +104,7 @@ def load_map(path: str | os.PathLike[str], format: str | None = None) -> LookupM
             the format is unknown. ImportError: If a library that it needs is missing; the error names the extra.
     """
     name = path_of(path, "load_map")
-    content = read_bytes(name, _LARGEST_FILE)
+    content = read_bytes(name, largest=1 << 31)
     fitting = (known for known in _FORMATS.values() if known.matches(name, content))
     chosen = next(fitting, None) if format is None else _named(format)
     described = _read_description(name) if chosen is None or chosen.described else {}
@@ -139,7 +137,7 @@ def _read_description(path: str) -> dict[str, Any]:
     if not os.path.isfile(beside := f"{path}.json"):
         return {}
     try:
-        described = json.loads(read_bytes(beside, _LARGEST_DESCRIPTION))
+        described = json.loads(read_bytes(beside, largest=1 << 16))
         if not isinstance(described, dict):
             raise ValueError("must be a mapping; got another value")
     except (ValueError, RecursionError) as error:

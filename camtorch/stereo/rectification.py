@@ -36,7 +36,6 @@ _KINDS: dict[str, tuple[tuple[type[Camera], type[Camera]], tuple[float, float]]]
     "latlon": ((LatLon, Equirectangular), (_NEAR_POLE, _TURN)),
     "cylindrical": ((TransverseCylindrical, Cylindrical), (math.tan(_NEAR_POLE), _TURN)),
 }
-_LINE = 129  # points along the middle of an image
 _PARALLEL = 1e-6  # the part of the view direction across the baseline below which it counts as zero
 _STEP = 1e-4  # on the plane of a projection, for finite differences of its scale
 _LARGEST = 8  # times the longest side of a camera, at most, for a default image_size
@@ -309,7 +308,7 @@ def _extent(views: list[tuple[Camera, Tensor]], projection: str, vertical: bool)
     limit = torch.tensor(reach[::-1] if vertical else reach).to(like)
     lows, highs = list[Tensor](), list[Tensor]()
     for view in views:  # the extent of the image's middle row and column
-        (row, of_row), (column, of_column) = middle_lines(*view, plane, limit, _LINE)
+        (row, of_row), (column, of_column) = middle_lines(*view, plane, limit, 129)
         places, valid = torch.stack((row[..., 0], column[..., 1]), -1), torch.stack((of_row, of_column), -1)
         lows.append(torch.where(valid, places, torch.inf).amin(-2))
         highs.append(torch.where(valid, places, -torch.inf).amax(-2))

@@ -329,11 +329,10 @@ def fixed(tensor: Tensor) -> Tensor:
     if is_parameter(tensor):
         return tensor
     if is_kept(tensor):
-        if torch.compiler.is_compiling() or not tensor.is_leaf or tensor._base is None:
-            return tensor
-        if not tensor._base.requires_grad:
-            return tensor
+        of = None if torch.compiler.is_compiling() or not tensor.is_leaf else tensor._base
         # a view, taken without a graph, of a tensor that learns: requires_grad is set, but it does not learn
+        if of is None or not of.requires_grad:
+            return tensor
     return nn.Parameter(tensor, requires_grad=False)
 
 

@@ -44,7 +44,6 @@ _PLANES: dict[str, tuple[float, Callable[[float], float]]] = {
 }
 """Projections with an infinite plane: their limit of fov in degrees, and the plane's width for a fov in radians."""
 _MIDDLE, _LEAST_SHARE = math.pi / 3, 0.1  # a wider fov warns: above 160 degrees in perspective, 278 in stereographic
-_LINE_SAMPLES = 257
 _SEAM = 1e-3  # radians to either side of it
 
 
@@ -117,7 +116,7 @@ def _fitted(camera: Camera, projection: str, size: tuple[int, int], rotation: Te
     plane = model(camera.intrinsics.new_tensor([1.0, 1.0, 0.0, 0.0]))
     limit = plane.intrinsics.new_tensor([widest, tallest]) / 2
     target = limit.new_tensor([size[1], size[0]])
-    (across, of_across), (down, of_down) = middle_lines(camera, rotation, plane, limit, _LINE_SAMPLES)
+    (across, of_across), (down, of_down) = middle_lines(camera, rotation, plane, limit, 257)
     if projection in _PLANES:  # both lines count both ways
         points, shown = torch.cat((across, down), -2), torch.cat((of_across, of_down), -1)
         shown = shown.unsqueeze(-1).expand(points.shape)

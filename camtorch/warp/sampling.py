@@ -200,7 +200,16 @@ def _render(images: Tensor, grid: Tensor, where: Sampling, levels: Pyramid, how:
     beyond: PaddingMode = "border" if minifies and padding_mode == "zeros" else padding_mode
     result = sample(images, grid, mode, beyond)
     if where.scale is not None:
-        result = _minified(result, levels, where.grid, where.scale, mode, beyond)
+        # a pixel that covers n source pixels takes the mean of about as many
+        level = where.scale.clamp(min=1).log2().unsqueeze(1)
+        last = min(levels.images.shape[-2:]).bit_length() - 1
+        for n in range(min(int(level.amax().ceil()) if may_look(level) else _TRACED_LEVELS, last)):
+            levels = levels.half
+            smaller = sample(levels.images, where.grid, mode, beyond)
+            share = (level - n).clamp(0, 1).to(result)
+            # an image without a share has no part either in what is not a number
+            blended = torch.where(share < 1, torch.lerp(result, smaller, share), smaller)
+            result = torch.where(share > 0, blended, result)
     if any(fill) or padding_mode != "zeros" or minifies:
         value = float(fill[0]) if len(fill) == 1 else result.new_tensor(fill)[:, None, None]
         if padding_mode == "zeros":
@@ -234,22 +243,6 @@ class Pyramid:
         return self._half
 
 
-def _minified(
-    result: Tensor, levels: Pyramid, grid: Tensor, scale: Tensor, mode: Mode, padding_mode: PaddingMode
-) -> Tensor:
-    """Return the result of `sample`, in which a pixel that covers n source pixels takes the mean of about as many."""
-    level = scale.clamp(min=1).log2().unsqueeze(1)
-    last = min(levels.images.shape[-2:]).bit_length() - 1
-    for n in range(min(int(level.amax().ceil()) if may_look(level) else _TRACED_LEVELS, last)):
-        levels = levels.half
-        smaller = sample(levels.images, grid, mode, padding_mode)
-        share = (level - n).clamp(0, 1).to(result)
-        # an image without a share has no part either in what is not a number
-        blended = torch.where(share < 1, torch.lerp(result, smaller, share), smaller)
-        result = torch.where(share > 0, blended, result)
-    return result
-
-
 def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
     """Return `grid_sample` with align_corners=False of images (B, C, H, W) at a grid (B or 1, H', W', 2).
 
@@ -277,8 +270,16 @@ def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode)
         result = F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
     else:
         result = images.new_empty(*images.shape[:2], *grid.shape[1:3])
-        for image in zip(result, images, grid, strict=True):
-            _sample_tiles(*image, threads, mode, padding_mode)
+        height = grid.shape[1] // threads  # of a tile; then come the rows that are left over
+        tiles = threads * height
+        for made, image, places in zip(result, images, grid, strict=True):
+            if tiles:
+                parts, same = places[:tiles].unflatten(0, (threads, height)), image.expand(threads, *image.shape)
+                sampled = F.grid_sample(same, parts, mode, padding_mode, align_corners=False)
+                made[:, :tiles].unflatten(1, (threads, height)).copy_(sampled.movedim(0, 1))
+            if tiles < len(places):
+                rest = F.grid_sample(image[None], places[None, tiles:], mode, padding_mode, align_corners=False)
+                made[:, tiles:] = rest[0]
     if mode == "bicubic" and not math.isfinite(result.sum()):
         # where the bicubic result is not finite, pixels without a weight, but for rounding, lose their part in it
         b, y, x = (~torch.isfinite(result)).any(1).nonzero(as_tuple=True)
@@ -294,22 +295,6 @@ def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode)
                 total += torch.where(weight != 0, weight * images[b, :, j, i], 0)
         result[b, :, y, x] = total
     return result
-
-
-def _sample_tiles(
-    result: Tensor, image: Tensor, grid: Tensor, count: int, mode: Mode, padding_mode: PaddingMode
-) -> None:
-    """Sample an image (C, H, W) by tiles of rows, and the rows that are left over."""
-    height = len(grid) // count
-    tiles = count * height
-    if tiles:
-        images = image.expand(count, *image.shape)
-        parts = grid[:tiles].unflatten(0, (count, height))
-        sampled = F.grid_sample(images, parts, mode, padding_mode, align_corners=False)
-        result[:, :tiles].unflatten(1, (count, height)).copy_(sampled.movedim(0, 1))
-    if tiles < len(grid):
-        rest = F.grid_sample(image[None], grid[None, tiles:], mode, padding_mode, align_corners=False)
-        result[:, tiles:] = rest[0]
 
 
 def _taps(position: Tensor, side: int, padding_mode: PaddingMode) -> list[tuple[Tensor, Tensor]]:
