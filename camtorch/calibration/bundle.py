@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.calibration import compiled as compiled_poses
 from camtorch.calibration.observations import Observations
@@ -78,7 +77,7 @@ class Prior(NamedTuple):
 class CameraObservations(NamedTuple):
     """The observations of one camera for B problems, V views and N points each; leading dims may be 1."""
 
-    model: type[Camera] | Camera  # the class, or a camera of it
+    model: type[Camera]
     points: Tensor  # (B, V, N, 3) in the board's frame
     pixels: Tensor  # (B, V, N, 2)
     weights: Tensor  # (B, V, N) of the squares, 0 for unseen points, whose other numbers are any finite ones
@@ -322,7 +321,7 @@ class Bundle:
 
     def shown(self, c: int, flat: Sequence[Tensor], errors: compiled_poses.Errors) -> Tensor:
         """Whether a camera, of the model itself and not the one for the search, has pixels, (B, V, N) bool."""
-        kind = _kind(self.observed[c].model)
+        kind = self.observed[c].model
         if kind.model_for_search() is kind:
             return errors.valid
         state = self.state(flat)
@@ -456,13 +455,9 @@ def _of_rows(values: Tensor, rows: Tensor) -> Tensor:
     return values if len(rows) == len(values) else values[rows]
 
 
-def _kind(model: type[Camera] | Camera) -> type[Camera]:
-    return model if isinstance(model, type) else type_before_parametrizations(model)
-
-
-def _template(model: type[Camera] | Camera, parameters: Tensor) -> Camera:
+def _template(model: type[Camera], parameters: Tensor) -> Camera:
     """Return a frozen camera of the model, a template for others with its number of coefficients."""
-    made = fixed_camera(_kind(model).model_for_search(), parameters[0, :4], parameters[0, 4:])
+    made = fixed_camera(model.model_for_search(), parameters[0, :4], parameters[0, 4:])
     made._warned = True  # a rejected step may have gone anywhere, and must not warn
     return made
 

@@ -21,7 +21,7 @@ from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, rotation_vector, skew_matrix
 from camtorch.projection.evaluation import compiled_of
 from camtorch.values.arguments import Numbers, as_number, broadcast_shapes, hinting, no_camera, working_dtype
-from camtorch.values.module import remade
+from camtorch.values.module import model_of, remade
 from camtorch.values.threads import on_one_thread
 
 _LEAST = 4  # points
@@ -341,7 +341,7 @@ def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor
     camera = task.camera
     parameters = torch.cat(camera._tensors, -1).detach()
     parameters = parameters.view(-1, parameters.shape[-1])
-    observed = CameraObservations(camera, task.points[:, None], task.pixels[:, None], task.weights[:, None])
+    observed = CameraObservations(model_of(camera), task.points[:, None], task.pixels[:, None], task.weights[:, None])
     found = adjust_poses(observed, parameters, Poses(rotations[:, None], translations[:, None]), steps=_SEARCH.steps)
     fine = found.converged & valid & ((task.weights > 0).sum(-1) >= _LEAST)
     fine = fine & (found.valid[0][:, 0] | (task.weights == 0)).all(-1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import struct
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -93,7 +94,18 @@ def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, thresh
         samples, size = _NEXT if drawn else _FIRST, 4 if compiled is None else 3
         numbers = torch.rand(samples, 3 if compiled else count, generator=generator, dtype=torch.float64)
         if compiled is not None:
-            search.compiled_round(rows, numbers, compiled)
+            given = [
+                lines.points.mT.contiguous(),
+                lines.measures.mT.contiguous(),
+                *search[1:3],
+                numbers,
+                *search[3:],
+                rows,
+            ]
+            following, places = ctypes.c_int64(0), [t.data_ptr() for t in given]
+            sizes = len(rows), count, samples, threshold**2, ctypes.addressof(following)
+            threads = min(thread_count(), len(rows), 1 + len(rows) * samples * count // _SHARED)
+            spread(partial(compiled.camtorch_consensus, _Agreement(*places, *sizes)), threads)
         else:
             search.round(rows, numbers.to(points.device))
         drawn += samples
@@ -139,15 +151,3 @@ class _Search(NamedTuple):
             index, part = index[better], part[better]
             self.best[part], self.costs[part] = poses[better, index], cost[better]
             self.agree[part] = (squares[better, index] < lines.threshold**2).sum(-1)
-
-    def compiled_round(self, rows: Tensor, numbers: Tensor, compiled: ctypes.CDLL) -> None:
-        """Run a round by native/consensus.c."""
-        points, measures = self.lines.points.mT.contiguous(), self.lines.measures.mT.contiguous()
-        read = (points, measures, self.order, self.counts, numbers, self.best, self.costs, self.agree, rows)
-        following, count = ctypes.c_int64(0), self.order.shape[-1]
-        call = _Agreement(
-            *(t.data_ptr() for t in read),
-            *(len(rows), count, len(numbers), self.lines.threshold**2, ctypes.addressof(following)),
-        )
-        work = len(rows) * len(numbers) * count
-        spread(lambda: compiled.camtorch_consensus(call), min(thread_count(), len(rows), 1 + work // _SHARED))

@@ -15,7 +15,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.least_squares.levenberg_marquardt import minimise
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.values.arguments import Numbers, check_devices, hinting, shown, working_dtype
-from camtorch.values.module import BatchedModule
+from camtorch.values.module import BatchedModule, model_of
 from camtorch.values.threads import on_one_thread
 
 M = TypeVar("M", bound=BatchedModule)
@@ -167,8 +167,8 @@ def _solve(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
         Poses.none(count, 1, start)._replace(translations=(start @ first.mT + shift)[:, None]),
         start.new_zeros(count, 2),
     )
-    seen_by = zip(task.cameras, pixels[..., None, None, :], seen[..., None, None], strict=True)
-    observed = [CameraObservations(camera, start.new_zeros(count, 1, 1, 3), *rest) for camera, *rest in seen_by]
+    seen_by = zip(map(model_of, task.cameras), pixels[..., None, None, :], seen[..., None, None], strict=True)
+    observed = [CameraObservations(model, start.new_zeros(count, 1, 1, 3), *rest) for model, *rest in seen_by]
     held = tuple(torch.zeros(p.shape[-1], dtype=torch.bool, device=p.device) for p in parameters)
     problem = Bundle(observed, state, Free(held, (False,) * len(observed), "positions"), None, 1.0)
     flat, tolerance, tiny = problem.flat(state), _SETTLED / (2 * views - 3).clamp(min=1), _NOTHING**2 * views

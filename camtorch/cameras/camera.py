@@ -318,7 +318,7 @@ class Camera(Freezable, Editable):
             lies before the fold of the lens. Whether the pixel is on the image is another question: `contains`.
             An invalid point gets the pixel (-1, -1) and zero gradient.
         """
-        return evaluate_points(self, PROJECT, points, "points", 3, self.batch_shape, self._tensors)
+        return evaluate_points(self, PROJECT, points)
 
     def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """Return the ray through each pixel.
@@ -330,7 +330,7 @@ class Camera(Freezable, Editable):
             rays (*B, *N, 3) of unit length (a point at distance d is `rays * d`), and valid (*B, *N) bool: the
             ray projects to this pixel. An invalid pixel gets the optical axis (0, 0, 1) and zero gradient.
         """
-        return evaluate_points(self, UNPROJECT, pixels, "pixels", 2, self.batch_shape, self._tensors)
+        return evaluate_points(self, UNPROJECT, pixels)
 
     def project_polyline(self, points: Numbers, extrinsics: Extrinsics | None = None) -> list[Tensor]:
         """Return the curves that straight edges in space become: a 3D box in a fisheye's image, a lane, a horizon.

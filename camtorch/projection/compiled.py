@@ -69,12 +69,9 @@ def project_vjp(
 
     `cotangents` are those of pixels, (2, C, N), of any strides.
     """
-    cameras, count, _ = points.shape
-    results = _empty((cameras, count, 3), native.dtype) if want_points else None
-    sums = _sums(native, cameras, count) if want_parameters else None
-    rows = points.data_ptr(), *points.stride(), *_points(results), 0, 0
-    _call(native, cameras, count, PROJECT_VJP, (*rows, *_cotangents(cotangents, cameras, count), address(sums)))
-    return results, None if sums is None else sums.sum(1).to(native.dtype)
+    assert cotangents.shape[1:] == points.shape[:2]  # C would read elsewhere otherwise
+    rows = points.data_ptr(), *points.stride()
+    return _vjp(native, PROJECT_VJP, rows, (0, 0), cotangents, 3 * want_points, want_parameters)
 
 
 def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[Tensor, Tensor]:
@@ -87,7 +84,7 @@ def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[
     sums = torch.zeros(2, cameras, count, (4 + native.parameters) * by_camera, dtype=torch.float64, device="cpu")
     tile = 1 if by_camera else _TILE
     for one, by, to in zip(torch.eye(2, dtype=native.dtype, device="cpu"), by_points, sums, strict=True):
-        given = points.data_ptr(), *points.stride(), *_points(by), 0, 0, one.data_ptr(), 0, 0, 1
+        given = points.data_ptr(), *points.stride(), by.data_ptr(), *by.stride(), 0, 0, one.data_ptr(), 0, 0, 1
         _call(native, cameras, count, PROJECT_VJP, (*given, to.data_ptr() if by_camera else 0), tile)
     return by_points.movedim(0, 2), sums.movedim(0, 2)
 
@@ -96,11 +93,30 @@ def unproject_vjp(
     native: Native, valid: Tensor, solution: Tensor, cotangents: Tensor, want_pixels: bool, want_parameters: bool
 ) -> tuple[Tensor | None, Tensor | None]:
     """Return the cotangents of pixels (C, N, 2), and of the cameras, for results of `unproject`; see `project_vjp`."""
-    cameras, count = valid.shape
-    results = _empty((cameras, count, 2), native.dtype) if want_pixels else None
-    sums = _sums(native, cameras, count) if want_parameters else None
-    rows = *_NO_ROWS, *_points(results), valid.data_ptr(), solution.data_ptr()
-    _call(native, cameras, count, UNPROJECT_VJP, (*rows, *_cotangents(cotangents, cameras, count), address(sums)))
+    assert cotangents.shape[1:] == valid.shape  # C would read elsewhere otherwise
+    known = valid.data_ptr(), solution.data_ptr()
+    return _vjp(native, UNPROJECT_VJP, _NO_ROWS, known, cotangents, 2 * want_pixels, want_parameters)
+
+
+def _vjp(
+    native: Native,
+    direction: int,
+    rows: tuple[int, ...],
+    known: tuple[int, int],
+    cotangents: Tensor,
+    size: int,
+    want_parameters: bool,
+) -> tuple[Tensor | None, Tensor | None]:
+    """Return the cotangents of rows (C, N, size), None if the size is 0, and of the cameras, None if not wanted."""
+    _, cameras, count = cotangents.shape
+    results = _empty((cameras, count, size), native.dtype) if size else None
+    tiles, sums = -(-count // _TILE), None
+    if want_parameters:
+        sums = torch.zeros(cameras, tiles, 4 + native.parameters, dtype=torch.float64, device="cpu")
+    places = _NO_ROWS if results is None else (results.data_ptr(), *results.stride())
+    component, camera, point = cotangents.stride()
+    by = cotangents.data_ptr(), camera, point, component, address(sums)
+    _call(native, cameras, count, direction, (*rows, *places, *known, *by))
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
@@ -257,21 +273,6 @@ def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
     if size[0] * size[1] * size[2] * dtype.itemsize >= memory.LEAST:
         return memory.empty(size, dtype, torch.contiguous_format)
     return torch.empty(size, dtype=dtype, device="cpu")
-
-
-def _sums(native: Native, cameras: int, count: int) -> Tensor:
-    tiles = -(-count // _TILE)
-    return torch.zeros(cameras, tiles, 4 + native.parameters, dtype=torch.float64, device="cpu")
-
-
-def _points(results: Tensor | None) -> tuple[int, ...]:
-    return _NO_ROWS if results is None else (results.data_ptr(), *results.stride())
-
-
-def _cotangents(given: Tensor, cameras: int, count: int) -> tuple[int, int, int, int]:
-    assert given.shape[1:] == (cameras, count)  # C would read elsewhere otherwise
-    component, camera, point = given.stride()
-    return given.data_ptr(), camera, point, component
 
 
 def _call(native: Native, cameras: int, count: int, direction: int, rows: tuple[int, ...], tile: int = _TILE) -> int:

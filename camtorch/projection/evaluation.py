@@ -24,17 +24,10 @@ if TYPE_CHECKING:
     from camtorch.projection.native_cameras import Native
 
 
-def evaluate_points(
-    camera: CameraLike,
-    direction: Direction,
-    values: Numbers,
-    name: str,
-    size: int,
-    batch: torch.Size,
-    tensors: Sequence[Tensor],
-) -> tuple[Tensor, Tensor]:
+def evaluate_points(camera: CameraLike, direction: Direction, values: Numbers) -> tuple[Tensor, Tensor]:
     """Return the planes and the mask of `evaluate_rows` for values (*B, *N, size), in their shape."""
-    lead, dims = batch, len(batch)
+    lead, tensors, size = camera.batch_shape, camera._tensors, direction.size
+    batch, dims = lead, len(lead)
     if (
         not isinstance(values, Tensor)
         or values.dtype != tensors[0].dtype
@@ -45,7 +38,7 @@ def evaluate_points(
         or values.shape[-1] != size
         or values.shape[:dims] != batch
     ):
-        values, lead = as_points(values, name, size, batch, tensors, type(camera).__name__)
+        values, lead = as_points(values, direction.name, size, batch, tensors, type(camera).__name__)
     shape = values.shape[:-1]
     rows = values.reshape(math.prod(lead), math.prod(shape[dims:]), size)
     planes, valid = camera._evaluate(direction, rows, lead, tensors)
@@ -78,7 +71,7 @@ def evaluate_rows(
     known = cameras_of(intrinsics, distortion) if way.is_known else None
     if way.is_native and known is not None and (made := known.native) is not None:
         if way.learns:
-            planes, valid = _Native.apply(*inputs, known, type(camera), direction)  # type: ignore[no-untyped-call]
+            planes, valid = _Native.apply(*inputs, known, direction)  # type: ignore[no-untyped-call]
             return planes, valid
         planes, valid, *_ = direction.native(made, rows.detach())
         return planes, valid
@@ -119,19 +112,13 @@ class _Native(Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        rows: Tensor,
-        intrinsics: Tensor,
-        distortion: Tensor,
-        cameras: CameraRows,
-        model: type[CameraLike],
-        direction: Direction,
+        ctx: Any, rows: Tensor, intrinsics: Tensor, distortion: Tensor, cameras: CameraRows, direction: Direction
     ) -> tuple[Tensor, Tensor]:
         made = cameras.native
         assert made is not None  # the caller checked it
         planes, valid, kept = direction.native_keeping(made, rows)
         ctx.save_for_backward(rows, intrinsics, distortion, *kept)
-        ctx.cameras, ctx.model, ctx.direction = cameras, model, direction
+        ctx.cameras, ctx.direction = cameras, direction
         ctx.mark_non_differentiable(valid)
         ctx.set_materialize_grads(False)
         return planes, valid
@@ -140,7 +127,7 @@ class _Native(Function):
     def backward(ctx: Any, by_planes: Tensor | None, _: Tensor | None) -> tuple[Tensor | None, ...]:
         """Return the cotangents of rows and parameters, with a graph if one is recorded."""
         if by_planes is None:
-            return (None,) * 6
+            return (None,) * 5
         rows, intrinsics, distortion, *kept = ctx.saved_tensors
         wanted, cameras = ctx.needs_input_grad, ctx.cameras
         if torch.is_grad_enabled() or not is_native(by_planes):
@@ -148,12 +135,12 @@ class _Native(Function):
             inputs, options = (rows, intrinsics, distortion), {"create_graph": True, "materialize_grads": True}
             leaves = [t for t, needed in zip(inputs, wanted[:3], strict=True) if needed]
             with torch.enable_grad():
-                planes = ctx.direction.formula(ctx.model, *inputs, cameras)[0]
+                planes = ctx.direction.formula(cameras.model, *inputs, cameras)[0]
                 gradients = iter(torch.autograd.grad(planes, leaves, by_planes, **options))
-            return *(next(gradients) if needed else None for needed in wanted[:3]), None, None, None
+            return *(next(gradients) if needed else None for needed in wanted[:3]), None, None
         of_parameters = wanted[1] or wanted[2]
         by_rows, sums = ctx.direction.native_vjp(cameras.native, *kept, by_planes, wanted[0], of_parameters)
-        return by_rows, *cameras.cotangents(sums, wanted[1:3]), None, None, None
+        return by_rows, *cameras.cotangents(sums, wanted[1:3]), None, None
 
 
 def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> CameraRows:

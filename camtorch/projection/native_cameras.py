@@ -193,10 +193,8 @@ class Lenses:
         return made
 
     def _keep_ends(self, end: float | Tensor) -> int:
-        if isinstance(end, float):
-            self._kept.append(ends := _same_ends(end, self.cameras))
-            return addressof(ends)
-        return self._keep(end.expand(self.cameras, 1).double())
+        ends = torch.as_tensor(end, dtype=torch.float64, device="cpu")
+        return self._keep(ends.expand(self.cameras, 1))
 
     def _ask(self, wanted: dict[str, int]) -> None:
         """Fill in the wanted parts of the domain: names and addresses."""
@@ -276,11 +274,6 @@ class Lenses:
         return self._keep(torch.cat([c.expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
 
 
-@functools.lru_cache(maxsize=16)
-def _same_ends(end: float, cameras: int) -> ctypes.Array[c_double]:
-    return (c_double * cameras)(*[end] * cameras)
-
-
 _LONGEST = 512  # the most coefficients of lenses that are kept
 _lenses = Kept(24)
 
@@ -335,12 +328,7 @@ class Native:
 
 
 def native_of(
-    optics_of: Optics,
-    intrinsics: Tensor,
-    k: Tensor,
-    usable: Tensor | None,
-    domain: Callable[[], Domain],
-    tables: bool = False,
+    optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None, domain: Callable[[], Domain], tables: bool
 ) -> Native | None:
     """Return cameras of intrinsics (C, 4) and coefficients (C, n) in the form of the compiled geometry.
 

@@ -71,4 +71,4 @@ def _keeping(native: Native, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tens
     return *compiled.project(native, points), (points,)
 
 
-PROJECT = Direction(_formula, compiled.project, _keeping, compiled.project_vjp)
+PROJECT = Direction(_formula, compiled.project, _keeping, compiled.project_vjp, "points", 3)

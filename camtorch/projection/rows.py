@@ -38,7 +38,7 @@ class CameraRows:
 
     def __init__(self, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor):
         """Take concrete values (C, 4), (C, n); or (4,), (n,) of one camera."""
-        self._model, self._learns = model, distortion.requires_grad
+        self.model, self._learns = model, distortion.requires_grad
         known = on_cpu(intrinsics, distortion)
         self._host = None if known is None else CameraRows(model, known[0], known[1])
         self.notes = note(intrinsics), note(distortion)
@@ -59,8 +59,8 @@ class CameraRows:
     def domain(self) -> Domain:
         """The domain of the lenses."""
         if self._host is not None and (native := self._host.native) is not None:
-            return Domain(self._model.optics, self.k).found_elsewhere(native.lenses.tables())
-        return domain_for(self._model, self.k, self._learns)
+            return Domain(self.model.optics, self.k).found_elsewhere(native.lenses.tables())
+        return domain_for(self.model, self.k, self._learns)
 
     def with_all_tables(self) -> CameraRows:
         """Return the same with all tables that a graph may need."""
@@ -71,8 +71,8 @@ class CameraRows:
     @cached_property
     def native(self) -> Native | None:
         """The cameras in the form of the compiled geometry; None if it does not have this model, or is not there."""
-        domain = partial(domain_for, self._model, self.k, self._learns)
-        return native_of(self._model.optics, self.intrinsics, self.k, self.usable, domain)
+        domain = partial(domain_for, self.model, self.k, self._learns)
+        return native_of(self.model.optics, self.intrinsics, self.k, self.usable, domain, tables=False)
 
     def cotangents(self, sums: Tensor | None, wanted: Sequence[bool]) -> tuple[Tensor | None, Tensor | None]:
         """Return the cotangents of intrinsics and distortion, if wanted, for sums of `compiled.project_vjp`."""
@@ -88,7 +88,7 @@ class CameraRows:
             return of_intrinsics, whole
         with torch.enable_grad():
             k = self.k.detach().requires_grad_()
-            chart, lens = self._model.optics(columns(k))
+            chart, lens = self.model.optics(columns(k))
             pairs = zip((*chart.parameters, *lens.parameters), sums.split(1, -1), strict=True)
             outputs, of_outputs = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)
             (by_coefficients,) = torch.autograd.grad(outputs, k, of_outputs, materialize_grads=True)
@@ -162,6 +162,8 @@ class Direction(NamedTuple):
     """The compiled call that also returns the tensors that `native_vjp` needs."""
     native_vjp: Callable[..., tuple[Tensor | None, Tensor | None]]
     """The compiled cotangents of rows and of the numbers of the cameras."""
+    name: str  # of the rows in messages
+    size: int
 
 
 class Traced(NamedTuple):

@@ -188,7 +188,7 @@ def _keeping(native: Native, pixels: Tensor) -> tuple[Tensor, Tensor, tuple[Tens
     return rays, valid, (valid.clone(), solution)
 
 
-UNPROJECT = Direction(_formula, compiled.unproject, _keeping, compiled.unproject_vjp)
+UNPROJECT = Direction(_formula, compiled.unproject, _keeping, compiled.unproject_vjp, "pixels", 2)
 
 
 def _search_recorded(domain: Domain, target: Planes2, found: Found) -> Found:

@@ -8,12 +8,10 @@ from torch import Tensor
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import Numbers, as_values
 
-KINDS = ("z", "distance")
-
 
 def as_depth(depth: Numbers, kind: str, size: tuple[int, int], owner: str, device: torch.device) -> Tensor:
     """Return a checked depth map (B, D, H, W) or (H, W) of a size, and check its kind."""
-    if not isinstance(kind, str) or kind not in KINDS:
+    if not isinstance(kind, str) or kind not in ("z", "distance"):
         raise ValueError(f'{owner}: kind must be "z" (along the optical axis) or "distance"; got {kind!r}')
     depth = as_values(depth, "depth", owner, device)
     if not depth.is_floating_point():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -14,12 +14,6 @@ from camtorch.projection.rows import unusable
 from camtorch.rays.lattices import angles_from_axis, reach
 from camtorch.values.arguments import Numbers, as_values, columns, working_dtype
 from camtorch.values.module import remade
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-
-_STEPS = 256
 
 
 @torch.no_grad()
@@ -63,7 +57,7 @@ def _reason(camera: CameraLike, row: dict[str, Tensor], point: Tensor) -> str:
         """Return the angle up to which rays of the point's azimuth are covered."""
         x, y = ray[:2].double()
         azimuth = torch.atan2(y, x)[None]
-        return float(reach(lambda rays: covers(rays.to(ray.dtype)), azimuth, most=theta, steps=_STEPS, rounds=3))
+        return float(reach(lambda rays: covers(rays.to(ray.dtype)), azimuth, most=theta, steps=256, rounds=3))
 
     def covered(rays: Tensor) -> Tensor:
         return chart.margin(*rays.unbind(-1)) > 0

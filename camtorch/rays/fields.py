@@ -172,22 +172,19 @@ def perspective_field(camera: CameraLike, gravity: Numbers, stride: int) -> tupl
     _broadcast(camera.batch_shape, down.shape[:-1], "gravity", owner)
 
     def field(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return _field(down, *local_frames(tangents(camera, pixels)))
+        frame, per_unit, valid = local_frames(tangents(camera, pixels))
+        upward = -down / down.square().sum(-1, keepdim=True).sqrt()
+        seen = (frame * upward[..., None, None, None, :].to(frame.dtype)).sum(-1)  # x, y, z of the local frame
+        across, along = seen[..., :2], seen[..., 2]
+        length = across.square().sum(-1)
+        tilted = valid & (length > _STRAIGHT)
+        across = torch.where(tilted[..., None], across, across.new_tensor([0.0, -1.0]))
+        up = (per_unit * across[..., None, :]).sum(-1)
+        up = torch.where(tilted[..., None], up / up.square().sum(-1, keepdim=True).sqrt(), 0.0)
+        latitude = torch.atan2(along, across.square().sum(-1).sqrt())
+        straight = along.detach().sign() * (math.pi / 2)
+        latitude = torch.where(valid, torch.where(tilted, latitude, straight), 0.0)
+        return latitude, up, valid.expand(latitude.shape)
 
     latitude, up, valid = over_image(camera, camera._fields, (*camera._tensors, down), stride, field)
     return latitude, up, valid
-
-
-def _field(gravity: Tensor, frame: Tensor, per_unit: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    upward = -gravity / gravity.square().sum(-1, keepdim=True).sqrt()
-    seen = (frame * upward[..., None, None, None, :].to(frame.dtype)).sum(-1)  # x, y, z of the local frame
-    across, along = seen[..., :2], seen[..., 2]
-    length = across.square().sum(-1)
-    tilted = valid & (length > _STRAIGHT)
-    across = torch.where(tilted[..., None], across, across.new_tensor([0.0, -1.0]))
-    up = (per_unit * across[..., None, :]).sum(-1)
-    up = torch.where(tilted[..., None], up / up.square().sum(-1, keepdim=True).sqrt(), 0.0)
-    latitude = torch.atan2(along, across.square().sum(-1).sqrt())
-    straight = along.detach().sign() * (math.pi / 2)
-    latitude = torch.where(valid, torch.where(tilted, latitude, straight), 0.0)
-    return latitude, up, valid.expand(latitude.shape)

@@ -13,7 +13,6 @@ _FIRST = 32  # pieces of an edge, of equal angles, before any is divided
 _LONGEST, _NEAR = 20.0, 0.05  # px: between points, and from a piece to its curve
 _SMALLEST = 1e-11  # of an edge's angle: the least piece, at which it is cut
 _FARTHEST = 16.0  # times the image: a pinhole's pixels grow without limit towards 90 degrees from its axis
-_ROUNDS = 60
 
 
 def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics | None) -> list[Tensor]:
@@ -32,7 +31,12 @@ def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics
     if points.ndim == 3:
         return [curve for line in points for curve in project_polyline(camera, line, None)]
     edges = _Edges(points.double())
-    middle, reach = _region(camera)
+    # the middle of the image, and the distance from it at which curves end
+    intrinsics = camera.intrinsics.detach().double()
+    middle, reach = intrinsics[2:], _FARTHEST * float(intrinsics[:2].max())
+    if camera.image_size is not None:
+        height, width = camera.image_size
+        middle, reach = middle.new_tensor([width / 2, height / 2]), _FARTHEST * max(height, width)
 
     def seen(places: Tensor) -> tuple[Tensor, Tensor]:
         pixels, valid = camera.project(edges.at(places))
@@ -40,7 +44,7 @@ def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics
 
     with torch.no_grad():
         places = torch.linspace(0, edges.count, _FIRST * edges.count + 1, dtype=torch.float64, device=points.device)
-        for _ in range(_ROUNDS):
+        for _ in range(60):
             pixels, valid = seen(places)
             both = valid[1:] & valid[:-1]
             start, step = places[:-1], places.diff()
@@ -83,12 +87,3 @@ class _Edges:
         # the ends exactly
         along = torch.where(share == 0, 0.0, torch.where(share == 1, 1.0, along.clamp(0, 1)))
         return self.start[edge] + along[:, None] * self.way[edge]
-
-
-def _region(camera: CameraLike) -> tuple[Tensor, float]:
-    """Return the middle of the image, and the distance from it at which curves end."""
-    intrinsics = camera.intrinsics.detach().double()
-    if camera.image_size is None:
-        return intrinsics[2:], _FARTHEST * float(intrinsics[:2].max())
-    height, width = camera.image_size
-    return intrinsics.new_tensor([width / 2, height / 2]), _FARTHEST * max(height, width)
