@@ -144,7 +144,6 @@ def adjust(
     loss: str | None = None,
     loss_scale: float = 1.0,
     steps: int = 60,
-    damping: float = FIRST_DAMPING,
     settled: float = SETTLED,
 ) -> Adjusted:
     """Return the state of least squares near a given one, for each of B problems, whose cameras see the same views.
@@ -156,7 +155,7 @@ def adjust(
     counts = torch.stack([(s.weights > 0).sum((-1, -2)) for s in problem.observed]).sum(0)
     tolerance, tiny = settled / (2 * counts - problem.unknowns).clamp(min=1), _NOTHING**2 * counts
     flat = problem.flat(state)
-    found = minimise(problem, flat, tolerance=tolerance, tiny=tiny, steps=steps, damping=damping)
+    found = minimise(problem, flat, tolerance=tolerance, tiny=tiny, steps=steps)
     by_camera = problem.all_errors(found.state, torch.arange(len(found.cost), device=found.cost.device))
     return Adjusted(
         problem.state(found.state),

@@ -260,7 +260,6 @@ class Search:
 
 
 def _seen_from(state: State, camera: int) -> Poses:
-    """Return the boards' poses in the frame of one camera."""
     rotations, translations = (t[:, camera, None] for t in state.mounts)
     return Poses(rotations @ state.boards.rotations, state.boards.translations @ rotations[:, 0].mT + translations)
 

@@ -16,7 +16,6 @@ from camtorch.calibration.compiled import Search, Solved, solve_poses
 from camtorch.calibration.ransac import consensus
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.mixed import Mixed
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, rotation_vector, skew_matrix
 from camtorch.projection.evaluation import compiled_of
@@ -30,7 +29,6 @@ _WORSE = 4.0  # times the least cost: a start below that may lead to less
 _MOVE = 1e-6  # of rays, the step of finite differences
 _THIN = 0.1  # of the extent of points: thinner ones may have the minima of a plane
 _LINE = 1e-6  # of the extent of points: thinner ones are on a line
-_ROUNDS = 8  # of choosing the near points and finding their minimum
 # Starts are near the optimum. `settled` is the squared distance to it, over the variance, at which a search ends, and
 # `nothing` the px that rounding may leave
 _SEARCH = Search(steps=40, settled=1e-7, nothing=1e-9, damping=1e-8)
@@ -120,8 +118,6 @@ def solve_pnp(
         threshold = as_number(threshold, "threshold", "solve_pnp")
         if not 0 < threshold < math.inf:
             raise ValueError(f"solve_pnp: threshold must be positive, in px; got {threshold:g}")
-    if isinstance(camera, Mixed):
-        return _solve_each_model(camera, object_points, pixels, weights, threshold)
     given = _Given.of(camera, object_points, pixels, weights)
     with torch.no_grad():
         found = _solve_compiled(given, threshold) or _solve_anywhere(given, threshold)
@@ -140,33 +136,8 @@ def solve_pnp(
         t.to(given.dtype).view(given.batch + t.shape[1:]) for t in (vectors, translations, rms, found.covariance)
     )
     valid, inliers = (t.view(given.batch + t.shape[1:]) for t in (found.valid, found.inliers))
-    return Pose(_frozen_pose(vectors, translations), rms, valid, inliers, covariance)
-
-
-def _solve_each_model(
-    camera: Mixed, object_points: Numbers, pixels: Numbers, weights: Numbers | None, threshold: float | None
-) -> Pose:
-    """Solve the poses of each group of a mixed batch and join them."""
-    owner, count, device = "solve_pnp", len(camera), camera.intrinsics.device
-    points = as_vectors(object_points, "object_points", 3, owner, device)
-    seen_at = as_vectors(pixels, "pixels", 2, owner, device)
-    given = seen_at.new_ones(seen_at.shape[-2]) if weights is None else as_tensor(weights, "weights", owner, device)
-    fields = points, seen_at, given[..., None]
-    leads = [tuple(field.shape[:-2]) for field in fields]
-    if any(lead not in ((), (1,), (count,)) for lead in leads):
-        raise ValueError(f"{owner}: batch dims must be () or ({count},) with a Mixed of {count} cameras; got {leads}")
-    found = []
-    for rows, group in camera.groups:
-        mine = [field[rows] if field.shape[:-2] == (count,) else field for field in fields]
-        pose = solve_pnp(group, mine[0], mine[1], weights=mine[2][..., 0], threshold=threshold)
-        found.append((pose.extrinsics.rotation, pose.extrinsics.translation, *pose[1:], pose.inliers, pose.covariance))
-    rotation, translation, *others = (camera._in_order(torch.cat(parts)) for parts in zip(*found, strict=True))
-    return Pose(_frozen_pose(rotation, translation), *others)
-
-
-def _frozen_pose(rotation: Tensor, translation: Tensor) -> Extrinsics:
-    """Return a frozen pose that keeps the graph of its tensors."""
-    return remade(_identity(), rotation=rotation, translation=translation)
+    pose = remade(_identity(), rotation=vectors, translation=translations)  # frozen, with the graph of its tensors
+    return Pose(pose, rms, valid, inliers, covariance)
 
 
 @cache
@@ -190,6 +161,8 @@ class _Given(NamedTuple):
         owner = "solve_pnp"
         if not isinstance(camera, Camera):
             raise TypeError(f"{owner}: camera must be a camera, as ct.KannalaBrandt(...); got {no_camera(camera)}")
+        if camera.is_mixed:
+            raise TypeError(f"{owner}: camera must be of one model; got a Mixed. Call it for each member, camera[i]")
         device = camera.intrinsics.device
         points = as_vectors(object_points, "object_points", 3, owner, device)
         seen_at = as_vectors(pixels, "pixels", 2, owner, device)
@@ -221,7 +194,6 @@ class _Given(NamedTuple):
 
 
 def _solve_compiled(given: _Given, threshold: float | None) -> Solved | None:
-    """Solve by compiled code, if there is any for the camera; otherwise return None."""
     points, pixels = given.points.detach(), given.pixels.detach()
     if not len(pixels) or (made := compiled_of([given.camera], pixels)) is None:
         return None
@@ -273,7 +245,6 @@ def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
 
 
 def _solve_anywhere(given: _Given, threshold: float | None) -> Solved:
-    """Return the poses on any device, for any camera."""
     given = given._replace(points=given.points.detach(), pixels=given.pixels.detach())
     task = _Task.of(given if given.weights is None else given._replace(weights=given.weights.detach()))
     weights = task.weights
@@ -303,7 +274,7 @@ def _solve_anywhere(given: _Given, threshold: float | None) -> Solved:
         near, before = _nearby(task, rotations, translations, threshold), torch.zeros_like(weights, dtype=torch.bool)
         lost, none = torch.full_like(weights[:, 0], torch.inf), weights.new_zeros(len(weights), 6, 7)
         found = _Found(lost, rotations, translations, none)
-        for _ in range(_ROUNDS):
+        for _ in range(8):  # choices of the near points
             if torch.equal(near, before):
                 break
             task = task._replace(weights=torch.where(near, weights, 0.0))

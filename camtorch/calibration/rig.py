@@ -143,7 +143,7 @@ def calibrate_rig(
     observed = [search.observed for search in searches]
     learns = tuple(parameters for search in searches for parameters in search.free().parameters)
     free = Free(learns, tuple(c > 0 for c in range(len(searches))), bend=bend)
-    first = _join_starts(observed, [_calibrate_alone(search) for search in searches], free)
+    first = _join_starts(searches, observed, free)
     adjusted = searches[0].adjusted(observed, first, free, steps=STEPS)
     found = results(searches, adjusted, free)
     cameras, state = dict(zip(by_name, found.cameras, strict=True)), found.adjusted.state
@@ -188,16 +188,14 @@ class _Alone(NamedTuple):
     has_pose: Tensor
 
 
-def _calibrate_alone(search: Search) -> _Alone:
-    has_pose = search.given.seen.any(-1)
-    state = replace(search, given=search.given.of(has_pose)).alone().state
-    (rows,) = has_pose.nonzero(as_tuple=True)
-    boards = Poses.none(1, len(has_pose), search.given.pixels).with_views(rows, state.boards)
-    return _Alone(state.parameters[0], boards, has_pose)
-
-
-def _join_starts(observed: list[CameraObservations], alone: list[_Alone], free: Free) -> State:
+def _join_starts(searches: list[Search], observed: list[CameraObservations], free: Free) -> State:
     """Return the start: mounts from pairs that see the same boards, boards from the camera that sees each best."""
+    alone = []
+    for search in searches:
+        has_pose = search.given.seen.any(-1)
+        state = replace(search, given=search.given.of(has_pose)).alone().state
+        boards = Poses.none(1, len(has_pose), search.given.pixels).with_views(has_pose.nonzero()[:, 0], state.boards)
+        alone.append(_Alone(state.parameters[0], boards, has_pose))
     mounts = Poses.none(1, len(alone), alone[0].parameters)
     turns, shifts = mounts.rotations[0], mounts.translations[0]
     together = torch.stack([one.has_pose for one in alone]).double()
@@ -207,8 +205,17 @@ def _join_starts(observed: list[CameraObservations], alone: list[_Alone], free: 
         rest = [c for c in range(len(alone)) if c not in known]
         i, j = divmod(int(together[known][:, rest].argmax()), len(rest))
         a, b = known[i], rest[j]
-        rotation, translation = _pose_between(alone[a], alone[b])
-        turns[b], shifts[b] = rotation @ turns[a], rotation @ shifts[a] + translation
+        both = alone[a].has_pose & alone[b].has_pose
+        (from_a, at_a), (from_b, at_b) = ((t[0, both] for t in alone[c].boards) for c in (a, b))
+        # from camera a to b: of all boards' poses, the one nearest to the others
+        rotations = from_b @ from_a.mT
+        translations = at_b - (rotations @ at_a[..., None])[..., 0]
+        turned = (rotations[:, None] - rotations).flatten(2).norm(dim=-1)
+        length = translations.norm(dim=-1).median().clamp(min=torch.finfo(translations.dtype).tiny)
+        shifted = (translations[:, None] - translations).norm(dim=-1) / length
+        middle = (turned + shifted).median(-1).values.argmin()
+        turns[b] = rotations[middle] @ turns[a]
+        shifts[b] = rotations[middle] @ shifts[a] + translations[middle]
         known.append(b)
     parameters = tuple(one.parameters for one in alone)
     boards, least = alone[0].boards, torch.full_like(alone[0].boards.translations[0, :, 0], torch.inf)
@@ -222,16 +229,3 @@ def _join_starts(observed: list[CameraObservations], alone: list[_Alone], free: 
         least = torch.where(better, cost, least)
         boards = Poses.where(better, own, boards)
     return State(parameters, mounts, boards, least.new_zeros(1, 2))
-
-
-def _pose_between(a: _Alone, b: _Alone) -> tuple[Tensor, Tensor]:
-    """Return the rotation and translation from camera a to b: of all boards' poses, the one nearest to the others."""
-    both = a.has_pose & b.has_pose
-    (from_a, at_a), (from_b, at_b) = ((t[0, both] for t in one.boards) for one in (a, b))
-    rotations = from_b @ from_a.mT
-    translations = at_b - (rotations @ at_a[..., None])[..., 0]
-    turned = (rotations[:, None] - rotations).flatten(2).norm(dim=-1)
-    length = translations.norm(dim=-1).median().clamp(min=torch.finfo(translations.dtype).tiny)
-    shifted = (translations[:, None] - translations).norm(dim=-1) / length
-    middle = (turned + shifted).median(-1).values.argmin()
-    return rotations[middle], translations[middle]

@@ -27,8 +27,6 @@ _TRIED = {
     0.65: (14.0, 28.0, 46.0, 66.0, 88.0),
 }
 _VIEWS, _POINTS = 24, 100  # at most, in a search
-_KEPT, _UNLIKE = 3, 2.0  # the most lenses kept, and their largest error over the best one's
-_FAR = 4.0  # the largest error over the best one's after the first round
 _ROUNDS = 4  # of finding poses
 _BAD = 2.0  # times the usual error: the pose of such a view may be wrong
 _IN_DOUBT = 4.0  # times the better pose's error: below it the other pose is refined as well
@@ -54,7 +52,6 @@ _ALONG = {
 _LOW_ORDERS = (1, 4)
 _REACH = 1.1  # how much further than the corners a start reaches
 _ERRS = 1.5  # times the unified lens' scale: above it the model does not fit
-_DOUBTED = 50  # the most views whose poses are checked again
 _OTHER = 0.05  # radians, or part of the distance: poses further apart are two minima
 _LOST = 0.01  # the part of the corners without a pixel above which a model is wrong
 
@@ -113,7 +110,7 @@ def other_poses(found: Adjusted, observations: Observations, model: type[Camera]
     lens = Lens(model, state.parameters[0], state.boards, image_size)
     errors = _lengths(found.residuals[0], found.valid[0], observations.seen)[0]
     # views with greater errors than many others are doubted
-    rows = errors.nanmedian(-1).values.argsort(descending=True)[:_DOUBTED]
+    rows = errors.nanmedian(-1).values.argsort(descending=True)[:50]
     boards = state.boards.of(rows, 1)
     lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(errors.nanmedian())))
     with torch.inference_mode():
@@ -211,12 +208,10 @@ def _subsample(observations: Observations, image_size: tuple[int, int]) -> Obser
 
 
 def _middle(image_size: tuple[int, int], like: Tensor) -> Tensor:
-    """Return the middle (2,) of the image."""
     return like.new_tensor([(image_size[1] - 1) / 2, (image_size[0] - 1) / 2])
 
 
 def _find_unified(few: Observations, image_size: tuple[int, int], fixed: Collection[str]) -> Lens:
-    """Return the unified camera that best explains the observations."""
     centre = _middle(image_size, few.pixels)
     reach = torch.where(few.seen, torch.linalg.vector_norm(few.pixels - centre, dim=-1), 0.0).amax()
     tried = [(alpha, math.radians(degrees)) for alpha, angles in _TRIED.items() for degrees in angles]
@@ -226,7 +221,8 @@ def _find_unified(few: Observations, image_size: tuple[int, int], fixed: Collect
     parameters = torch.cat((focal, focal, centre.expand(len(tried), 2), alpha), -1)
     lens = Lens(UCM, parameters, Poses.none(1, 1, parameters), image_size)
     begun = None
-    for rounds, kept, unlike in ((1, len(tried), _FAR), (_ROUNDS, _KEPT, _UNLIKE)):
+    # rounds, the most lenses kept after these, and their largest error over the best one's
+    for rounds, kept, unlike in ((1, len(tried), 4.0), (_ROUNDS, 3, 2.0)):
         boards, errors = _find_poses(lens.camera, few, rounds, begun)
         by_view = errors.nanmedian(-1).values.sort(-1).values
         score = by_view[:, : math.ceil(_TRIMMED * by_view.shape[1])].mean(-1)

@@ -76,8 +76,6 @@ def convert(
 
 
 class _Task(NamedTuple):
-    """Rows of a batch to convert, and the options."""
-
     source: Reference
     model: type[CameraLike]
     models: Mapping[str, type[CameraLike]]

@@ -14,7 +14,6 @@ from camtorch.projection.camera_like import CameraLike
 from camtorch.rays.lattices import angles_from_axis, slopes_at_axis
 from camtorch.values.arguments import columns
 
-_ROUNDS = 3
 _LAWSON_ROUNDS, _LAWSON_STEPS, _PATIENCE = 40, 2, 6
 _SETTLED = 1e-8  # the part of the cost left to gain at which a search ends
 _NOTHING, _NEARLY_NOTHING = 1e-11, 1e-9  # px
@@ -71,7 +70,7 @@ def fit(
             low, high = (torch.where(fixed.isnan(), ends, fixed) for ends in (low, high))
         parameters = parameters.clamp(low, high)
         within = observations._replace(weights=torch.zeros_like(observations.weights))
-        for _ in range(_ROUNDS):
+        for _ in range(3):
             # a chart may cover more rays after a fit to those that it covers
             weights = observations.weights * to_sensor(camera, parameters[:, 4:], observations.rays).covered
             more = (weights != within.weights).any(-1) & ~found

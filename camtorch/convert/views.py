@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -78,7 +78,9 @@ def sample_with_rings(camera: CameraLike, image_size: tuple[int, int] | None, si
     """Return `sample` with further rays on circles around the axis: errors of a radial lens change along radii."""
     whole = sample(camera, image_size, side, limit)
     reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
-    rings = seen(camera, image_size, lattices.ray_fan(reach * torch.linspace(0, 1, _RADII, **_like(camera)), _AZIMUTHS))
+    # steps of float32 might exceed half a circle
+    steps = torch.linspace(0, 1, _RADII, dtype=reach.dtype, device=reach.device)
+    rings = seen(camera, image_size, lattices.ray_fan(reach * steps, _AZIMUTHS))
     return Observations(*(torch.cat(pair, 1) for pair in zip(whole, rings, strict=True)))
 
 
@@ -113,7 +115,7 @@ def focal_at_axis(camera: CameraLike) -> Tensor:
 
 def radii(camera: CameraLike, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
     """Return angles and radii for `Camera.fit_start`; reach: (C,) the last angle, 0 if nothing is seen."""
-    steps = torch.arange(1, _RADII + 1, **_like(camera)) / _RADII
+    steps = torch.arange(1, _RADII + 1).to(camera.intrinsics) / _RADII
     angles = torch.where(reach > 0, reach, 1.0)[:, None] * steps
     pixels, valid = camera.project(lattices.ray_fan(angles, _AZIMUTHS))
     plane = (pixels - slopes[:, None, None, 2:]) / slopes[:, None, None, :2]
@@ -125,8 +127,3 @@ def radii(camera: CameraLike, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Te
     end, slope = (torch.where(last > 0, t.gather(-1, at), angles[:, :1]) for t in (radii, growth))
     index = torch.arange(_RADII, device=slopes.device)
     return angles, torch.where(seen > 0, radii, end + slope * (index - at))
-
-
-def _like(camera: CameraLike) -> dict[str, Any]:
-    # steps of float32 might exceed half a circle
-    return {"dtype": camera.intrinsics.dtype, "device": camera.intrinsics.device}

@@ -70,10 +70,10 @@ def sensor_jacobians(
 def _backward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:
     """Differentiate backward, in two passes for any number of coefficients; each point has its own copy of these."""
     with torch.inference_mode(False), torch.enable_grad():
-        shape = rays.shape[:-1]
+        shape, kept = rays.shape[:-1], torch.contiguous_format
         # contiguous planes are several times as fast; copies can require grad after inference mode
-        planes = [_copy(w).requires_grad_() for w in rays.detach().unbind(-1)]
-        own = [_copy(c.expand(shape)).requires_grad_() for c in columns(k.detach())]
+        planes = [w.clone(memory_format=kept).requires_grad_() for w in rays.detach().unbind(-1)]
+        own = [c.expand(shape).clone(memory_format=kept).requires_grad_() for c in columns(k.detach())]
         points = _to_sensor(camera, own, planes, furthest)
         one, leaves = torch.ones(shape, dtype=rays.dtype, device=rays.device), [*planes, *own]
         slopes = [
@@ -83,10 +83,6 @@ def _backward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, fu
     by_all = torch.stack([torch.stack(row, 1) for row in slopes], 1)
     points = SensorPoints(points.a.detach(), points.b.detach(), points.covered)
     return SensorJacobians(points, by_all[:, :, :3], by_all[:, :, 3:])
-
-
-def _copy(plane: Tensor) -> Tensor:
-    return plane.clone(memory_format=torch.contiguous_format)
 
 
 def _forward(camera: CameraLike | type[CameraLike], k: Tensor, rays: Tensor, furthest: float) -> SensorJacobians:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import operator
 import struct
 import threading
 from collections.abc import Callable
-from ctypes import addressof, c_int64
+from ctypes import Array, addressof, c_int64
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -70,8 +69,8 @@ def project_vjp(
     `cotangents` are those of pixels, (2, C, N), of any strides.
     """
     assert cotangents.shape[1:] == points.shape[:2]  # C would read elsewhere otherwise
-    rows = points.data_ptr(), *points.stride()
-    return _vjp(native, PROJECT_VJP, rows, (0, 0), cotangents, 3 * want_points, want_parameters)
+    given = points.data_ptr(), *points.stride(), 0, 0
+    return _vjp(native, PROJECT_VJP, given, cotangents, 3 * want_points, want_parameters)
 
 
 def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[Tensor, Tensor]:
@@ -94,18 +93,12 @@ def unproject_vjp(
 ) -> tuple[Tensor | None, Tensor | None]:
     """Return the cotangents of pixels (C, N, 2), and of the cameras, for results of `unproject`; see `project_vjp`."""
     assert cotangents.shape[1:] == valid.shape  # C would read elsewhere otherwise
-    known = valid.data_ptr(), solution.data_ptr()
-    return _vjp(native, UNPROJECT_VJP, _NO_ROWS, known, cotangents, 2 * want_pixels, want_parameters)
+    given = *_NO_ROWS, valid.data_ptr(), solution.data_ptr()
+    return _vjp(native, UNPROJECT_VJP, given, cotangents, 2 * want_pixels, want_parameters)
 
 
 def _vjp(
-    native: Native,
-    direction: int,
-    rows: tuple[int, ...],
-    known: tuple[int, int],
-    cotangents: Tensor,
-    size: int,
-    want_parameters: bool,
+    native: Native, direction: int, given: tuple[int, ...], cotangents: Tensor, size: int, want_parameters: bool
 ) -> tuple[Tensor | None, Tensor | None]:
     """Return the cotangents of rows (C, N, size), None if the size is 0, and of the cameras, None if not wanted."""
     _, cameras, count = cotangents.shape
@@ -116,7 +109,7 @@ def _vjp(
     places = _NO_ROWS if results is None else (results.data_ptr(), *results.stride())
     component, camera, point = cotangents.stride()
     by = cotangents.data_ptr(), camera, point, component, address(sums)
-    _call(native, cameras, count, direction, (*rows, *places, *known, *by))
+    _call(native, cameras, count, direction, (*given[:4], *places, *given[4:], *by))
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
@@ -127,11 +120,6 @@ class Lattices:
     `source_size`. given: both cameras and the turns, as in `Move`. room: returns memory of so many bytes. Images
     sampled in the same call find the lattices at `places`, the fields of `Job` of sampler.h.
     """
-
-    nodes: Tensor
-    """The nodes (C, 2, N): the first (n + 5) (m + 5) of them; the others are on the rim."""
-    cells: Tensor
-    """(C, n, m) int32."""
 
     def __init__(
         self,
@@ -148,6 +136,7 @@ class Lattices:
         dtype, count, is_double = probes.dtype, probes.shape[1], probes.dtype == torch.float64
         n, m = (-(-side // 8) for side in size)
         nodes, self._most = (n + 5) * (m + 5), cameras * n * m
+        # the first (n + 5) (m + 5) nodes are those of the lattice, the others are on the rim
         self.nodes = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
         self.cells = torch.empty(cameras, n, m, dtype=torch.int32, device="cpu")
         # exact positions, of which parts are written; nodes in float32; scratch; valid flags of the probes
@@ -175,16 +164,10 @@ class Lattices:
 class Between:
     """Cameras, and others that see their rays after a turn: maps pixels of the first to pixels of the others."""
 
-    cameras: int
-    """The number of cameras of each, unless one serves all."""
-    is_batch: bool
-    """Whether pixels have a batch dim."""
-    dtype: torch.dtype
-
     def __init__(self, start: Native, end: Native, turns: Tensor | None, size: tuple[int, int], is_batch: bool):
         """Prepare turns (3, 3) or (C, 3, 3), of the cameras' dtype, and the (height, width) of the others' image."""
-        self._start, self._end, self._turns, self.is_batch = start, end, turns, is_batch
-        self.dtype = start.dtype
+        self._start, self._end, self._turns, self.dtype = start, end, turns, start.dtype
+        self.is_batch = is_batch  # whether pixels have a batch dim
         count, strides = (1, (0, 0)) if turns is None else (turns.numel() // 9, turns.stride())
         self.cameras = max(start.cameras, end.cameras, count)
         start.add_table()
@@ -215,19 +198,14 @@ class Between:
         made = Lattices(probes, size, self._size, tolerance, padding, self.cameras, first_row, given, _kept_memory)
         return None if self._run("camtorch_lattices", made.words, self.cameras, made.counters) else made.results()
 
-    def _run(self, name: str, call: object, tiles: int, counters: ctypes.Array[c_int64]) -> int:
+    def _run(self, name: str, call: object, tiles: int, counters: Array[c_int64]) -> int:
         """Return flags of parts that are not made. `counters` are the call's next tile and the number of places."""
         threads = min(thread_count(), tiles) if tiles > 1 else 1
         return run_and_follow(entry(name, c_int64), call, threads, counters, self._start, self._end)
 
 
 def run_and_follow(
-    run: Callable[[object], int],
-    call: object,
-    threads: int,
-    counters: ctypes.Array[c_int64],
-    start: Native,
-    end: Native,
+    run: Callable[[object], int], call: object, threads: int, counters: Array[c_int64], start: Native, end: Native
 ) -> int:
     """Return flags of the parts that a call leaves undone; if azimuths must be followed first, it is repeated."""
     while True:

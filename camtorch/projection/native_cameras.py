@@ -137,7 +137,6 @@ class Lenses:
     _kept: list[object]
 
     def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool = False):
-        """Make the lenses; see `native_of`."""
         self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, [k]
         self._slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
         self.struct = struct = CamerasStruct()
@@ -193,8 +192,10 @@ class Lenses:
         return made
 
     def _keep_ends(self, end: float | Tensor) -> int:
-        ends = torch.as_tensor(end, dtype=torch.float64, device="cpu")
-        return self._keep(ends.expand(self.cameras, 1))
+        if isinstance(end, float):
+            self._kept.append(ends := _same_ends(end, self.cameras))
+            return addressof(ends)
+        return self._keep(end.expand(self.cameras, 1).double())
 
     def _ask(self, wanted: dict[str, int]) -> None:
         """Fill in the wanted parts of the domain: names and addresses."""
@@ -274,6 +275,11 @@ class Lenses:
         return self._keep(torch.cat([c.expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
 
 
+@functools.lru_cache(maxsize=16)
+def _same_ends(end: float, cameras: int) -> ctypes.Array[c_double]:
+    return (c_double * cameras)(*[end] * cameras)
+
+
 _LONGEST = 512  # the most coefficients of lenses that are kept
 _lenses = Kept(24)
 
@@ -292,7 +298,6 @@ class Native:
     _make_lenses: Callable[[Native], Lenses]
 
     def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
-        """Make the cameras; see `native_of`."""
         self.lenses, self.plan, self.struct = lenses, lenses.plan, CamerasStruct.from_buffer_copy(lenses.struct)
         kept = self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
         self.cameras, self.dtype, self.parameters = intrinsics.shape[0], intrinsics.dtype, lenses.plan.parameters

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 Planes2 = tuple[Tensor, Tensor]
 Found = tuple[Tensor, Tensor, Tensor]
 
-_START_ROUNDS = 6
 _CLOSE = 0.02
 _SLOWEST_TURN = 0.05
 _GIVE_UP = 1e-4
@@ -212,7 +211,7 @@ class _Search:
 
         far = torch.ones_like(u, dtype=torch.bool) if self.within is None else self.within
         zero = torch.zeros_like(u)
-        _, a, b, *_ = repeat(look, far, (zero, zero, target * target, wanted, zero, zero), _START_ROUNDS)
+        _, a, b, *_ = repeat(look, far, (zero, zero, target * target, wanted, zero, zero), 6)
         return a, b
 
 

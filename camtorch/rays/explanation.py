@@ -40,7 +40,6 @@ def explain(camera: CameraLike, points: Numbers) -> list[str]:
 
 
 def _reason(camera: CameraLike, row: dict[str, Tensor], point: Tensor) -> str:
-    """Return the reason why a camera of this model, with a row of usable values, has no pixel for a point (3,)."""
     camera = remade(camera, **row)
     shown = ", ".join(f"{value:.6g}" for value in point.tolist())
     if not bool(torch.isfinite(point).all()):

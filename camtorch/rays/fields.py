@@ -55,17 +55,13 @@ def patch_centres(size: tuple[int, int], stride: int, like: Tensor, owner: str) 
 
 
 def over_image(
-    camera: CameraLike,
-    memo: Kept,
-    inputs: Sequence[Tensor],
-    stride: int,
-    function: Callable[[Tensor], tuple[Tensor, ...]],
+    camera: CameraLike, memo: Kept, inputs: Sequence[Tensor], stride: int, make: Callable[[Tensor], tuple[Tensor, ...]]
 ) -> tuple[Tensor, ...]:
-    """Return the function of all pixels or patches (*B, H, W, 2); small results are kept while no `inputs` learn."""
+    """Make planes from all pixels or patches (*B, H, W, 2); small results are kept while no `inputs` learn."""
 
     def compute() -> tuple[Tensor, ...]:
         grid = camera.pixel_grid(stride)
-        return function(grid.expand(*camera.batch_shape, *grid.shape))
+        return make(grid.expand(*camera.batch_shape, *grid.shape))
 
     if is_unknown(camera.intrinsics):  # nothing is kept, and a comparison would bound symbolic sizes
         return compute()

@@ -163,17 +163,6 @@ def test_covariance_is_that_of_refits(far):
     assert ((spread > 0.93) & (spread < 1.07)).all()
 
 
-def test_mixed_cameras():
-    parts = [problems(fov, 3, 20, 0.4) for fov in (60, 190)]
-    camera = ct.cat([part[0].expand(len(part[1])) for part in parts])
-    target, seen = (torch.cat([part[i] for part in parts]) for i in (1, 2))
-    pose = ct.solve_pnp(camera, target, seen, threshold=THRESHOLD)
-    expected = [ct.solve_pnp(*part[:3], threshold=THRESHOLD) for part in parts]
-    torch.testing.assert_close(pose.covariance, torch.cat([e.covariance for e in expected]))
-    assert torch.equal(pose.inliers, torch.cat([e.inliers for e in expected]))
-    assert pose.valid.all()
-
-
 def test_gradients_are_those_of_the_inliers():
     camera, target, seen, *_ = problems(60, 2, 20, 0.4)
     grads = []

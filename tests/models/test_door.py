@@ -168,7 +168,11 @@ WRONG = [
     (lambda: ct.Mixed.from_fov(60, image_size=SIZE), TypeError, r"ct.Mixed\(\[...\]\)"),
     (lambda: ct.save(MIXED, "mixed.json"), TypeError, "must be of one model; got a Mixed"),
     (lambda: MIXED.project(torch.rand(3, 5, 3)), ValueError, r"points must be .* with batch dims \*B = \(2,\)"),
-    (lambda: ct.solve_pnp(MIXED, torch.rand(5, 12, 3), torch.rand(2, 12, 2)), ValueError, r"must be \(\) or \(2,\)"),
+    (
+        lambda: ct.solve_pnp(MIXED, torch.rand(12, 3), torch.rand(2, 12, 2)),
+        TypeError,
+        "one model; got a Mixed. Call it",
+    ),
     (lambda: MIXED.plucker(POSE(torch.rand(3, 3), torch.rand(3, 3))), ValueError, "of extrinsics must broadcast"),
     (lambda: CAMERA.plucker(EYE), TypeError, r"Extrinsics.from_matrix\(T\)"),
     (lambda: MIXED.perspective_field((0, 0, 0)), ValueError, "gravity must have a direction"),
