@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from camtorch.boards.boards import Board, as_board
+from camtorch.boards.boards import as_board
 from camtorch.boards.finding import gather
 from camtorch.calibration import selection
 from camtorch.calibration.calibrate import calibrate
 from camtorch.calibration.rig import RigCalibration, calibrate_rig
 from camtorch.calibration.verdict import Calibration
-from camtorch.cameras.camera import MODELS, as_model
+from camtorch.cameras.camera import MODELS, Camera, as_model
+from camtorch.cameras.rig import Rig
 from camtorch.cli import targets
-from camtorch.cli.searching import Views, find_views
-from camtorch.cli.terminal import note, progress
+from camtorch.cli.searching import find_views
+from camtorch.cli.terminal import bar, note
 from camtorch.io import CameraFileError, formats
 
 _BOARD_OPTIONS = ("marker", "legacy", "spacing", "border", "dictionary")
@@ -34,19 +36,44 @@ def run(arguments: argparse.Namespace) -> None:
     candidates = _candidates(arguments)
     if arguments.board is None:
         raise ValueError("--board must be given. Write --board COLUMNSxROWS, as in 9x6")
-    options = {name: value for name in _BOARD_OPTIONS if (value := getattr(arguments, name)) not in (None, False)}
+    given = {name: value for name in _BOARD_OPTIONS if (value := getattr(arguments, name)) not in (None, False)}
     words = "{} {}x{}".format(arguments.type or "chessboard", *arguments.board)
-    board = as_board(words, arguments.square or 1.0, options, "--board")
+    board = as_board(words, arguments.square or 1.0, given, "--board")
     if board.is_symmetric and len(cameras) > 1:
         note("this board looks the same after a turn: hold the cameras alike, or use even and odd corners, as in 9x6")
     views, sizes = find_views(cameras, board, "" if arguments.square is None else "m")
     if arguments.square is None:
         note("no --square is given: distances are in sides of a square")
-    result = _calibrated(arguments, board, views, sizes, candidates)
+    fixed = tuple(filter(None, (arguments.fixed or "").split(",")))
+    options: dict[str, Any] = {"fixed": fixed, "loss": arguments.loss, "loss_scale": arguments.loss_scale}
+    points, pixels, models, counts = board.points(), {}, {}, {}
+    unseen = np.full((len(points), 2), np.nan)
+    for name, size in sizes.items():
+        pixels[name] = np.stack([of_view[name].pixels if name in of_view else unseen for of_view in views.values()])
+        models[name], counts[name] = candidates[0]
+        if len(candidates) > 1:
+            seen = pixels[name][[name in of_view for of_view in views.values()]]
+            with bar("trying models", 1.0, bar_format="{desc}: {percentage:3.0f} %|{bar}| {remaining} left") as shown:
+                own: dict[str, Any] = {"progress": lambda part, shown=shown: shown.update(part - shown.n)}
+                chosen = selection.select(points, seen, image_size=size, candidates=candidates, **own, **options)
+            models[name], counts[name] = chosen.best.model, chosen.best.count
+            head = f"{name}: " if name else ""
+            print(f"{head}models by cross-validation, px per point:", *chosen.lines(), sep="\n")
+    left_out = [f"{key} with {n}" if n else key for key, n in selection.CANDIDATES if (key, n) not in candidates]
+    if len(candidates) > 1 and left_out:
+        note(f"{path.name} cannot hold {', '.join(left_out)}, which were not tried; a .json can")
+    options["bend"] = arguments.bend
+    result: Calibration | RigCalibration
+    made: Camera | Rig
+    if list(sizes) == [""]:
+        result = calibrate(models[""], points, pixels[""], image_size=sizes[""], count=counts[""], **options)
+        made, what, names = result.camera, result.camera.key, [of_view[""].path.name for of_view in views.values()]
+    else:
+        result = calibrate_rig(models, points, pixels, image_sizes=sizes, count=counts, **options)
+        made, what, names = result.rig, f"{len(sizes)} cameras", list(views)
     if not result.converged:
         hint = "nothing is written. Check --board and the images, or try another --model, or --loss huber"
         raise ValueError(f"the calibration must converge; got rms {result.rms:.4g} px, {hint}")
-    names = list(views) if isinstance(result, RigCalibration) else [of_view[""].path.name for of_view in views.values()]
     text = repr(result)  # with names of views instead of numbers, and options instead of arguments
     numbered = r"\b([Vv]iews? )(\d+(?:, \d+)*)"
     text = re.sub(numbered, lambda m: m[1] + re.sub(r"\d+", lambda n: names[int(n[0])], m[2]), text)
@@ -56,8 +83,8 @@ def run(arguments: argparse.Namespace) -> None:
         across, down = (f"{bend:.3g}" for bend in result.bend)
         print(f"board: its middle lies {across} off its left and right, {down} off its top and bottom")
     path.parent.mkdir(parents=True, exist_ok=True)
-    formats.save(result.rig if isinstance(result, RigCalibration) else result.camera, path, arguments.format)
-    print(f"{path}: {f'{len(result.rig)} cameras' if isinstance(result, RigCalibration) else result.camera.key}")
+    formats.save(made, path, arguments.format)
+    print(f"{path}: {what}")
 
 
 def _cameras(arguments: argparse.Namespace) -> dict[str, list[Path]]:
@@ -105,36 +132,3 @@ def _candidates(arguments: argparse.Namespace) -> list[tuple[str, int]]:
     if not held:
         raise ValueError(f"{failure}. Write -o camera.json, which holds every model")
     return held
-
-
-def _calibrated(
-    arguments: argparse.Namespace,
-    board: Board,
-    views: Views,
-    sizes: Mapping[str, tuple[int, int]],
-    candidates: list[tuple[str, int]],
-) -> Calibration | RigCalibration:
-    """Return the calibration of a camera, or of the rig if there are several."""
-    fixed = tuple(filter(None, (arguments.fixed or "").split(",")))
-    options = {"fixed": fixed, "loss": arguments.loss, "loss_scale": arguments.loss_scale}
-    points, pixels, models, counts = board.points(), {}, {}, {}
-    unseen = np.full((len(points), 2), np.nan)
-    for name, size in sizes.items():
-        pixels[name] = np.stack([of_view[name].pixels if name in of_view else unseen for of_view in views.values()])
-        models[name], counts[name] = candidates[0]
-        if len(candidates) > 1:
-            seen = pixels[name][[name in of_view for of_view in views.values()]]
-            with progress("trying models") as show:
-                chosen = selection.select(
-                    points, seen, image_size=size, candidates=candidates, progress=show, **options
-                )
-            models[name], counts[name] = chosen.best.model, chosen.best.count
-            head = f"{name}: " if name else ""
-            print(f"{head}models by cross-validation, px per point:", *chosen.lines(), sep="\n")
-    left_out = [f"{key} with {n}" if n else key for key, n in selection.CANDIDATES if (key, n) not in candidates]
-    if len(candidates) > 1 and left_out:
-        note(f"{arguments.output.name} cannot hold {', '.join(left_out)}, which were not tried; a .json can")
-    if list(sizes) == [""]:
-        own = {"image_size": sizes[""], "count": counts[""], "bend": arguments.bend}
-        return calibrate(models[""], points, pixels[""], **own, **options)
-    return calibrate_rig(models, points, pixels, image_sizes=sizes, count=counts, bend=arguments.bend, **options)

@@ -68,16 +68,16 @@ def _leaves_open(path: Path) -> bool:
 
 def read_camera(path: Path, name: str | None = None, model: str | None = None, size: Size | None = None) -> Camera:
     """Read the only camera of a file, or the one called `name`; see `read_rig`."""
-    return _one(path, read_rig(path, name, model, size))
+    return one(path, read_rig(path, name, model, size))
 
 
 def read_other(path: Path, name: str | None = None, model: str | None = None) -> Camera:
     """Read the camera to compare with: the only one of its file, or the one called `name`."""
     rig = read_rig(path, model=model if model is not None and _leaves_open(path) else None)
-    return _one(path, rig, None if len(rig.cameras) == 1 else name)
+    return one(path, rig, None if len(rig.cameras) == 1 else name)
 
 
-def _one(path: Path, rig: Rig, name: str | None = None) -> Camera:
+def one(path: Path, rig: Rig, name: str | None = None) -> Camera:
     """Return the camera called `name`, or the only one."""
     if name is None and len(rig.cameras) > 1:
         raise ValueError(f"{path}: must have one camera; got several. Choose one with --name: {', '.join(rig.cameras)}")

@@ -14,7 +14,6 @@ from camtorch.cli import words
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 Add: TypeAlias = Callable[..., Any]  # the method `add_argument` of a command, or of a group of its options
 _FORMAT = "of OUT; by default as its name ends"
-_BOARDS = ("chessboard", "charuco", "aprilgrid")  # copied from `camtorch.boards`, whose import needs numpy
 
 
 def add_all(commands: Commands) -> None:
@@ -148,7 +147,8 @@ def _calibrate(commands: Commands) -> None:
     rig("--right", nargs="+", metavar="IMAGE", help="of the right one")
     rig("--rig", nargs="+", metavar="NAME=IMAGE", help="of any number of cameras: a folder or a pattern")
     board = command.add_argument_group("board").add_argument
-    board("--type", choices=_BOARDS, help="chessboard by default")
+    kinds = ("chessboard", "charuco", "aprilgrid")  # copied from `camtorch.boards`, whose import needs numpy
+    board("--type", choices=kinds, help="chessboard by default")
     text = "columns and rows: of a chessboard's inner corners, of ChArUco's squares, of AprilGrid's tags"
     board("--board", type=words.board, metavar="CxR", help=text)
     text = "the side of a square or AprilTag, as 30mm, or in metres: 0.03; if left out, distances are in squares"
@@ -182,7 +182,6 @@ def _from_model(add: Add, *others: str) -> None:
 
 
 def _projection(add: Add) -> None:
-    """Add options for the projection of a dewarped image."""
     ways = ("perspective", "stereographic", "cylindrical", "equirectangular")
     text = "keeps lines straight (the default), shapes, upright lines; or shows all around"
     add("--projection", choices=ways, default="perspective", help=text)
@@ -192,7 +191,6 @@ def _projection(add: Add) -> None:
 
 
 def _output(add: Add, text: str, default: Path | None = None) -> None:
-    """Add options for the output file."""
     add("-o", "--output", type=words.path, default=default, metavar="OUT", help=text)
     _force(add)
 

@@ -43,7 +43,7 @@ class Dewarping:
         with torch.no_grad():
             result = warp(image[None])[0].permute(1, 2, 0).contiguous()
         del image  # frees hundreds of megabytes
-        images.write(target, result.numpy(), orientation=orientation, profile=profile, synced=False)
+        images.write(target, result.numpy(), orientation=orientation, profile=profile)
         about = f" and shows {100 * shown:.0f} % of the photograph"
         if shown < _MUCH and self.arguments.projection == "perspective" and self.arguments.fov is None:
             about += "; --projection stereographic or cylindrical shows more, and --fov sets how much"

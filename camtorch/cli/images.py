@@ -25,14 +25,7 @@ def check_kind(path: Path, *, is_video: bool = False) -> None:
         raise ImageFileError(f"{path}: the suffix of the {kind} must be one of {', '.join(known)}; got {what}")
 
 
-def write(
-    path: Path,
-    pixels: NDArray[Any],
-    *,
-    orientation: int | None = None,
-    profile: bytes | None = None,
-    synced: bool = True,
-) -> None:
+def write(path: Path, pixels: NDArray[Any], *, orientation: int | None = None, profile: bytes | None = None) -> None:
     """Write (H, W, C) uint8 or (H, W, 1) uint16 by `replacing`, and make missing folders."""
     image = Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels)
     kind = Image.registered_extensions()[path.suffix.lower()]
@@ -42,7 +35,7 @@ def write(
         options["exif"][ORIENTATION] = orientation
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path, synced=synced) as (file,):
+        with replacing(path, synced=False) as (file,):
             image.save(file, kind, **options)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error

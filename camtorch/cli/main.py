@@ -18,8 +18,6 @@ from camtorch.cli import commands, processes
 from camtorch.cli.terminal import lacks_memory, note, reason, say
 from camtorch.native import library
 
-_INTERRUPT, _PIPE = 128 + 2, 128 + 13  # shells' exit codes for signals
-
 
 class _Parser(argparse.ArgumentParser):
     def __init__(self, **options: Any):
@@ -68,10 +66,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(end="", flush=True)  # unless stdout is closed
     except BrokenPipeError:  # the reader closed the pipe, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _PIPE
+        return 128 + 13  # as shells do for the signal
     except KeyboardInterrupt:
         say("interrupted")
-        return _INTERRUPT
+        return 128 + 2
     except Exception as error:
         if not (isinstance(error, (ValueError, ImportError, OSError)) or lacks_memory(error)):
             raise

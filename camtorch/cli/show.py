@@ -8,7 +8,7 @@ import numpy as np
 
 from camtorch.analysis.numbers import difference, summarise
 from camtorch.cli import images, targets
-from camtorch.cli.cameras import read_other, read_rig
+from camtorch.cli.cameras import one, read_other, read_rig
 from camtorch.plot.figures import require_matplotlib
 from camtorch.viewer.viewer import write_viewer
 
@@ -25,13 +25,11 @@ def run(arguments: argparse.Namespace) -> None:
         targets.check(html, force=arguments.force, inputs=(path, against, photograph))
     elif photograph is not None:
         raise ValueError("--html must be given with --image; got none")
-    cameras = read_rig(path, arguments.name, arguments.from_model, arguments.size).cameras
-    single = any(file is not None for file in (output, against, html))
-    if single and len(cameras) > 1:
-        raise ValueError(f"{path}: must have one camera; got several. Choose one with --name: {', '.join(cameras)}")
-    ((name, camera), *_), other = cameras.items(), None
-    if single and camera.image_size is None:
+    rig, other = read_rig(path, arguments.name, arguments.from_model, arguments.size), None
+    if any(file is not None for file in (output, against, html)) and one(path, rig).image_size is None:
         raise ValueError(f"{path}: must have an image size; got none. Add --size WxH")
+    cameras = {name: one(path, rig, name) for name in rig.cameras}
+    ((name, camera), *_) = cameras.items()
     if against is not None:
         other = read_other(against, arguments.name, arguments.from_model)
         if other.image_size not in (None, camera.image_size):
@@ -41,8 +39,6 @@ def run(arguments: argparse.Namespace) -> None:
         html.parent.mkdir(parents=True, exist_ok=True)
         write_viewer(camera, html, photograph)
     for name, camera in cameras.items():
-        if camera.batch_shape:
-            raise ValueError(f"{path}: {name} must be one camera; got a batch of {tuple(camera.batch_shape)}")
         print(f"{path}: {name}", *summarise(camera).lines(), sep="\n")
     if other is not None:
         compared = difference(camera, other)

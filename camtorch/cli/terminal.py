@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
-from collections.abc import Callable, Iterator
 from typing import Any
 
 
@@ -44,10 +42,3 @@ def bar(what: str, total: float | None, unit: str = "", **options: Any) -> Any:
     delay, interval = (0.5, 0.1) if sys.stderr.isatty() else (30.0, 30.0)  # seconds
     common = {"leave": False, "smoothing": 0, "file": sys.stderr, "delay": delay, "mininterval": interval}
     return tqdm(desc=what, total=total, unit=f" {unit}", **common | options)
-
-
-@contextlib.contextmanager
-def progress(what: str) -> Iterator[Callable[[float], None]]:
-    """Yield a function that shows the finished part, from 0 to 1."""
-    with bar(what, 1.0, bar_format="{desc}: {percentage:3.0f} %|{bar}| {remaining} left") as shown:
-        yield lambda part: shown.update(part - shown.n)

@@ -23,7 +23,6 @@ FORMATS = frozenset({*WRITTEN, ".avi", ".mts", ".ts"})  # suffixes of files that
 _CODECS = {"libx264": {"crf": "18", "mbtree": "0"}, "libvpx-vp9": {"crf": "24", "b": "0"}, "ffv1": dict[str, str]()}
 _READ = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"  # no playlists, which could read other files
 _THREADS = 4  # of an encoder: its output depends on their number, so fixed for all machines
-_CUT = 0.5  # seconds that may be missing at the end
 _COLOURS = ("color_range", "colorspace", "color_primaries", "color_trc")  # colour attributes of a frame
 
 
@@ -166,7 +165,7 @@ def remake(
             count += 1
             done()
         output.mux(new.encode(None))
-        if length - end > max(_CUT, 0.02 * length):
+        if length - end > max(0.5, 0.02 * length):  # seconds that may be missing
             raise ValueError(f"{source}: must last {length:.1f} seconds; got {end:.1f}. It is cut off or damaged")
     return (first.height, first.width), count
 
@@ -207,7 +206,6 @@ def _new_stream(
 
 
 def _copied_stream(output: Any, other: Any, source: Path, target: Path) -> Any:
-    """Return the new file's stream for a stream of sound or subtitles."""
     try:
         copy = output.add_stream_from_template(other)
     except ValueError:

@@ -187,7 +187,6 @@ class _File:
 
 def render(rig: Rig, lossy: Lossy) -> str:
     """Return the text of a file of one camera or several; the second of two may have a pose."""
-    lossy.no_images(rig)
     names, ends = list(rig.cameras), list(rig.cameras)
     if len(names) == 1:
         ends = [names[0] if re.fullmatch(_NAMES, names[0]) else ""]

@@ -19,7 +19,6 @@ from torch import Tensor
 from camtorch.values.arguments import warn
 
 ORIENTATION = 0x0112  # the Exif tag, also of TIFF
-_WIDTH, _HEIGHT = 256, 257  # tags of TIFF
 _DEEP = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 _T = Image.Transpose
 _TURNS = _T.FLIP_LEFT_RIGHT, _T.ROTATE_180, _T.FLIP_TOP_BOTTOM, _T.TRANSPOSE, _T.ROTATE_90, _T.TRANSVERSE, _T.ROTATE_270
@@ -109,9 +108,9 @@ def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int,
 
 
 def _stored_size(image: Image.Image) -> tuple[int, int]:
-    """Return the stored (height, width) of an image that is not loaded yet."""
+    """Return (height, width) of an image that is not loaded yet."""
     tags = getattr(image, "tag_v2", {})
-    return tags.get(_HEIGHT, image.height), tags.get(_WIDTH, image.width)
+    return tags.get(257, image.height), tags.get(256, image.width)  # of TIFF, which Pillow may turn
 
 
 @contextlib.contextmanager

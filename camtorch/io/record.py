@@ -64,7 +64,6 @@ class Record:
         raise CameraFileError(self.path, self.place or "content", reason) from None
 
     def _check(self, kind: type, what: str) -> None:
-        """Raise a CameraFileError if the value is of another kind."""
         if not isinstance(self.value, kind):
             self.fail(f"must be {what}; got {self._found()}")
 

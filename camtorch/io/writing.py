@@ -31,7 +31,20 @@ def replacing(*paths: str | os.PathLike[str], synced: bool = True) -> Iterator[l
     """
     targets = [os.path.realpath(path) for path in paths]
     with contextlib.ExitStack() as stack:
-        files = [_opened_beside(target, stack) for target in targets]
+        files = list[IO[bytes]]()
+        for target in targets:
+            folder, mode = os.path.dirname(target), os.stat(target).st_mode if os.path.exists(target) else None
+            if not os.path.isdir(folder):
+                raise FileNotFoundError(errno.ENOENT, "no such folder", folder)
+            if mode is not None and not stat.S_ISREG(mode):
+                raise OSError(errno.EINVAL, "no ordinary file, so it cannot be replaced", target)
+            name = os.path.join(folder, f".{secrets.token_hex(12)}.part")  # the longest name has no room for a suffix
+            rights = 0o666 if mode is None else stat.S_IMODE(mode)  # the kernel takes the umask from both
+            stack.callback(Path(name).unlink, missing_ok=True)
+            file = open(name, "x+b", opener=lambda name, flags, rights=rights: os.open(name, flags, rights))  # noqa: SIM115
+            files.append(stack.enter_context(file))
+            if mode is not None:
+                os.chmod(name, rights)
         yield files
         for file in files:
             file.flush()
@@ -40,22 +53,6 @@ def replacing(*paths: str | os.PathLike[str], synced: bool = True) -> Iterator[l
             file.close()
         for file, target in zip(files, targets, strict=True):
             os.replace(file.name, target)
-
-
-def _opened_beside(path: str, stack: contextlib.ExitStack) -> IO[bytes]:
-    """Open an empty file in the folder of `path` with the same rights; `stack` closes and removes it."""
-    folder, mode = os.path.dirname(path), os.stat(path).st_mode if os.path.exists(path) else None
-    if not os.path.isdir(folder):
-        raise FileNotFoundError(errno.ENOENT, "no such folder", folder)
-    if mode is not None and not stat.S_ISREG(mode):
-        raise OSError(errno.EINVAL, "no ordinary file, so it cannot be replaced", path)
-    name = os.path.join(folder, f".{secrets.token_hex(12)}.part")  # the longest name has no room for a suffix
-    rights = 0o666 if mode is None else stat.S_IMODE(mode)  # the kernel takes the umask from both
-    stack.callback(Path(name).unlink, missing_ok=True)
-    file = open(name, "x+b", opener=lambda name, flags: os.open(name, flags, rights))  # noqa: SIM115
-    if mode is not None:
-        os.chmod(name, rights)
-    return stack.enter_context(file)
 
 
 def number(value: float) -> str:

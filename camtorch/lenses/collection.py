@@ -67,7 +67,7 @@ class Lens:
     @property
     def is_optical(self) -> bool:
         """Whether a lens makes such images: not stretched or reprojected, positive focal lengths (31 have negative)."""
-        return is_as_seen(self.digital, self.stretch) and self._exists
+        return not self.digital and all(factor in (None, 1.0) for factor in self.stretch) and self._exists
 
     @property
     def _exists(self) -> bool:
@@ -99,16 +99,6 @@ class Lens:
         return f"<{self.name}: {', '.join(parts)}>"
 
 
-def is_as_seen(digital: str, stretch: tuple[float | None, float | None]) -> bool:
-    """Whether images are neither reprojected nor stretched after the lens. See `Lens`."""
-    return not digital and all(factor in (None, 1.0) for factor in stretch)
-
-
-def as_number(text: str) -> float | None:
-    """Return the number of a text in the collection; None if the text is empty."""
-    return float(text) if text else None
-
-
 @cache
 def columns() -> tuple[dict[str, list[str]], NDArray[np.float64]]:
     """Return the columns of text by name, and the columns of numbers (9, N): fx fy cx cy k1 k2 k3 k4 rms."""
@@ -127,11 +117,12 @@ def columns() -> tuple[dict[str, list[str]], NDArray[np.float64]]:
 def entries() -> tuple[Lens, ...]:
     """Return all lenses, in the order of the collection."""
     texts, numbers = columns()
-    rows = zip(*texts.values(), numbers.T.tolist(), strict=True)
+    stated = ([float(text) if text else None for text in texts[name]] for name in _TEXTS[6:9])
+    rows = zip(*(texts[name] for name in _TEXTS[:6]), *stated, texts["digital_lens"], numbers.T.tolist(), strict=True)
     return tuple(
         Lens(
             *(brand, body, lens, setting, (int(height), int(width)), tuple(values[:4]), tuple(values[4:8]), values[8]),
-            *(as_number(readout), (as_number(across), as_number(down)), digital),
+            *(readout, (across, down), digital),
         )
         for brand, body, lens, setting, width, height, readout, across, down, digital, values in rows
     )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.opaque import opaque
-from camtorch.lenses.collection import as_number, columns, is_as_seen
+from camtorch.lenses.collection import entries
 from camtorch.models import KannalaBrandt
 from camtorch.projection.domain import Domain
 
@@ -29,30 +29,19 @@ class Lenses(NamedTuple):
     distortion: Tensor  # (N, 4)
     reach: Tensor  # (N,): the radius of the image at the lens's fold in focal lengths
 
-    def at(self, share: Tensor) -> Lenses:
-        """Return the lenses at shares (*B,) of the list, from 0 to 1."""
-        index = (share * len(self.reach)).long().clamp(0, len(self.reach) - 1).to(self.reach.device)
-        return Lenses(*(column[index].to(share) for column in self))
-
 
 @cache
 def _good() -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return sizes (N, 2) = (height, width), intrinsics and distortion (N, 4), and `Lenses.reach`, of good lenses."""
-    texts, numbers = columns()
-    table = torch.from_numpy(numbers)
-    sides = [[float(side) for side in texts[name]] for name in ("height", "width")]
-    size = torch.tensor(sides, dtype=torch.float64, device=table.device)  # not on the default device
-    plain = [
-        is_as_seen(digital, (as_number(across), as_number(down)))
-        for digital, across, down in zip(*(texts[n] for n in ("digital_lens", "h_stretch", "v_stretch")), strict=True)
-    ]
-    off = (table[[3, 2]] / size - 0.5).abs().amax(0)
-    is_good = torch.tensor(plain, device=table.device) & (table[8] < _RMS) & (off < _CENTRE) & (table[0] > 0)
-    is_good = is_good & ((table[0] / table[1] - 1).abs() < _ASPECT)
-    intrinsics, distortion = table[:4, is_good].mT, table[4:8, is_good].mT.contiguous()
+    good = [lens for lens in entries() if lens.is_optical and lens.rms < _RMS]
+    rows = [(*lens.image_size, *lens.intrinsics, *lens.distortion) for lens in good]
+    table = torch.tensor(rows, dtype=torch.float64, device="cpu")  # not on the default device
+    off = (table[:, [5, 4]] / table[:, :2] - 0.5).abs().amax(-1)
+    table = table[(off < _CENTRE) & ((table[:, 2] / table[:, 3] - 1).abs() < _ASPECT)]
+    size, intrinsics, distortion = (part.contiguous() for part in table.split((2, 4, 4), -1))
     parts = [Domain(KannalaBrandt.optics, part).edge2 for part in distortion.split(_PART)]
     reach = torch.cat(parts).sqrt()[:, 0]
-    return size[:, is_good].mT, intrinsics, distortion, reach
+    return size, intrinsics, distortion, reach
 
 
 def covering(intrinsics: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor:
@@ -108,5 +97,7 @@ def _drawn_shapes(share: Tensor, *_: object) -> tuple[Tensor, Tensor, Tensor]:
 def _drawn(
     share: Tensor, size: tuple[int, int], low: float | None, high: float | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    found = lenses_for(size, None if low is None or high is None else (low, high)).at(share)
-    return found.intrinsics, found.distortion, found.reach
+    lenses = lenses_for(size, None if low is None or high is None else (low, high))
+    index = (share * len(lenses.reach)).long().clamp(0, len(lenses.reach) - 1).to(lenses.reach.device)
+    intrinsics, distortion, reach = (column[index].to(share) for column in lenses)
+    return intrinsics, distortion, reach

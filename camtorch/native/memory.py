@@ -57,19 +57,16 @@ def _block(size: int) -> mmap.mmap | None:
     """Return `size` bytes: a kept block, or a new one; None if the system lacks large pages or the memory."""
     for block in tuple(_idle):
         if len(block) == size:
-            try:
+            with suppress(ValueError):  # another thread has it
                 _idle.remove(block)
-            except ValueError:  # another thread has it
-                continue
-            return block
+                return block
     if not hasattr(mmap, "MADV_HUGEPAGE"):
         return None
-    try:
+    with suppress(OSError):
         block = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         block.madvise(mmap.MADV_HUGEPAGE)  # small pages, each new to the process, would take several times as long
-    except OSError:
-        return None
-    return block
+        return block
+    return None
 
 
 def _keep(block: mmap.mmap) -> None:

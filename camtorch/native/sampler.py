@@ -150,7 +150,6 @@ def is_quick(images: Tensor, result: Tensor, mode: str) -> bool:
 
 
 def _are_together(result: Tensor, mode: str) -> bool:
-    """Whether channels are made side by side."""
     channels = result.shape[1]
     return mode == "bilinear" and channels in (3, 4) and result.stride()[1::2] == (1, channels)
 
