@@ -76,8 +76,7 @@ class Transform(FrontEnd, A.DualTransform):
         return result if isinstance(camera, Unknown) else {**result, "camera": detached(camera)}
 
     def get_params(self) -> dict[str, Any]:
-        generator = torch.Generator().manual_seed(self.py_random.getrandbits(63))
-        drawn = self.augmentation.drawn(1, 1.0, False, generator)
+        drawn = self.augmentation.drawn(1, 1.0, False, torch.Generator().manual_seed(self.py_random.getrandbits(63)))
         return {"draw": {name: value.tolist() for name, value in drawn.items()}}
 
     def apply_with_params(self, params: dict[str, Any], *args: Any, **data: Any) -> dict[str, Any]:

@@ -176,8 +176,7 @@ class Augmentation(SampleTransform):
         Returns:
             `apply` (B,) bool, and for each range a float64 tensor (B,) or (B, size) of that name and unit.
         """
-        count = as_whole(count, "count", self._name)
-        if count < 0:
+        if (count := as_whole(count, "count", self._name)) < 0:
             raise ValueError(f"{self._name}: count must not be negative; got {count}")
         return self.drawn(count, self.p, self.same_on_batch, generator)
 
@@ -198,8 +197,7 @@ class Augmentation(SampleTransform):
 
     def with_boxes(self, draw: Mapping[str, Any], boxes: Tensor | Sequence[Tensor] | None) -> Mapping[str, Any]:
         """Return a draw with the boxes it needs of those of samples, (B, M, 4), or (M, 4) each, or None."""
-        missing = {name: index for name, index in self.crops.items() if name not in draw}
-        if not missing:
+        if not (missing := {name: index for name, index in self.crops.items() if name not in draw}):
             return draw
         if boxes is None:
             raise ValueError(
@@ -263,8 +261,7 @@ class Augmentation(SampleTransform):
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
         """Check a draw, and return it as arrays unless it is recorded."""
         as_mapping(draw, "draw", self._name, "what draw() returns")
-        missing = [name for name in ("apply", *self.ranges, *self.crops) if name not in draw]
-        if missing:
+        if missing := [name for name in ("apply", *self.ranges, *self.crops) if name not in draw]:
             has = ", ".join(map(str, draw)) or "nothing"
             raise ValueError(f"{self._name}: draw must have {', '.join(missing)}; got {has}")
         sizes = {**{name: interval.size for name, interval in self.ranges.items()}, **dict.fromkeys(self.crops, 4)}

@@ -91,7 +91,6 @@ class Part:
 
     @property
     def warp(self) -> Warp:
-        """By which these rows move, if they do."""
         assert self.moves is not None
         return self.moves.warp(self.camera) if isinstance(self.moves, Drawn) else self.moves
 
@@ -262,7 +261,6 @@ class Change:
 
     @property
     def _counts(self) -> list[int]:
-        """How many samples each part is."""
         return [self.count if part.rows is None else len(part.rows) for part in self.parts]
 
     @property

@@ -45,9 +45,7 @@ _TURNS = "yaw", "pitch", "roll"
 _LESS = 0.9  # of the least field of view that was asked for: below that a warning says so
 _TINY, _HUGE = 1e-3, 1e3
 _LIMITS: dict[str, dict[str, Any]] = {
-    "yaw": {"least": -180, "most": 180},
-    "pitch": {"least": -180, "most": 180},
-    "roll": {"least": -180, "most": 180},
+    **{name: {"least": -180, "most": 180} for name in _TURNS},
     "zoom": {"least": _TINY, "most": _HUGE, "around": 1},
     "lens": {},
     "fov": {"least": _TINY, "most": 360},
@@ -61,8 +59,7 @@ _LIMITS: dict[str, dict[str, Any]] = {
     "cos4": {"least": -2, "most": 2},
 }
 """Of each range, in the order in which they are drawn."""
-_EXACT = "fov", "crop", "vignetting", "cos4"
-"""Return a single number as a range of only that number."""
+_EXACT = "fov", "crop", "vignetting", "cos4"  # a single number is a range of only that number
 _AUTO = "focal", "centre", "distortion", "crop"
 _told: set[tuple[object, ...]] = set()
 

@@ -136,8 +136,7 @@ class FaceNormalizer(SampleTransform):
         if not isinstance(sample.get("camera", camera), Camera):
             raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(sample['camera'])}")
         kinds = {name: value for name, (_, value) in named.items()}
-        listed = [name for name in ("head_pose", "rvec", "tvec", "face_center") if isinstance(kinds.get(name), list)]
-        if listed:
+        if listed := [n for n in ("head_pose", "rvec", "tvec", "face_center") if isinstance(kinds.get(n), list)]:
             raise TypeError(f"{self._name}: {', '.join(listed)} must be one tensor for all samples; got a list")
         if "head_pose" in kinds:
             head, centre = kinds["head_pose"][..., :3, :3], kinds["head_pose"][..., :3, 3]
@@ -162,8 +161,7 @@ class FaceNormalizer(SampleTransform):
         augmentations), and any other fields: gaze, keypoints, 3D points, images.
         """
         sample = self._given(sample, fields)
-        missing = [name for name in ("camera", "rotation", "source_camera") if name not in sample]
-        if missing:
+        if missing := [name for name in ("camera", "rotation", "source_camera") if name not in sample]:
             raise ValueError(f"{self._name}: a sample to move back must have {', '.join(missing)}; got none")
         normal, source, rotation = (sample.pop(name) for name in ("camera", "source_camera", "rotation"))
         batch = self._batch(sample, normal, predicted=True)

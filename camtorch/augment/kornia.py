@@ -36,7 +36,6 @@ from camtorch.values.dtypes import narrow, widen
 from camtorch.warp.sampling import Mode
 
 Flags: TypeAlias = dict[str, Any]
-_POINTS = "keypoints"
 _BACK = "back"  # the flag for moving back
 
 
@@ -184,8 +183,8 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
     def apply_transform_keypoint(self, input: Keypoints, params: Params, flags: Flags, transform: Any = None) -> Any:
         def move(change: Change, pixels: Tensor) -> tuple[Tensor, Tensor]:
             given = torch.where((pixels == -1).all(-1, keepdim=True), torch.nan, pixels)
-            moved = self.augmentation.moved_by(change, {_POINTS: given}, predicted=True)
-            return torch.where(moved[_POINTS].isnan(), -1.0, moved[_POINTS]), moved[f"{_POINTS}_valid"]
+            moved = self.augmentation.moved_by(change, {"keypoints": given}, predicted=True)
+            return torch.where(moved["keypoints"].isnan(), -1.0, moved["keypoints"]), moved["keypoints_valid"]
 
         result, self.keypoints_valid = self._move_rows(input, 3, params, flags, move)
         return result

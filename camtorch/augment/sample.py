@@ -191,8 +191,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         self._name = type(self).__name__
         self.camera = camera
         self.fields: dict[str, str] = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
-        wrong = {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}
-        if wrong:
+        if wrong := {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}:
             raise ValueError(f"{self._name}: fields must map names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
         self.options: Options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
         # None where each warp says
@@ -229,7 +228,6 @@ class SampleTransform(KeepsCamera, nn.Module):
         return f"{meant} are {', '.join(known)}" + (f". {has} has it" if has else "")
 
     mirroring: Mirroring | None = None  # what changes places where an augmentation mirrors; None: it never does
-
     needs_camera: bool = True  # whether samples, or it, need a camera; edits do not
 
     def _camera_of(self, named: Named) -> Camera:
@@ -336,8 +334,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         return *parts, *fields.items()
 
     def _checked_batch(self, sample: Sample, camera: Any, fields: Mapping[str, str], predicted: bool) -> Batch:
-        named = self._sorted(sample, fields)
-        if not named:
+        if not (named := self._sorted(sample, fields)):
             raise ValueError(f"{self._name}: the sample must have a field that moves; got none of {', '.join(KINDS)}")
         camera = self._camera_of(named) if camera is None else camera
         batched = not isinstance(sample, Single) and is_batch(named, camera)

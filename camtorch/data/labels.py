@@ -62,9 +62,9 @@ class Samples(Dataset[Sample]):
 
     def __getitem__(self, index: int) -> Sample:
         sample = self._sample(self, self._entries[operator.index(index)])
-        return (
-            sample | {"image": _image_at(sample["path"]), "path": str(sample["path"])} if "path" in sample else sample
-        )
+        if path := sample.get("path"):
+            sample |= {"image": _image_at(path), "path": str(path)}
+        return sample
 
     def __iter__(self) -> Iterator[Sample]:
         return map(self.__getitem__, range(len(self)))
