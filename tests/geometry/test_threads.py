@@ -166,6 +166,7 @@ def test_several_threads_use_one_camera():
             assert all(torch.equal(a, b) for a, b in zip(results, expected, strict=True))
 
 
+@pytest.mark.slow
 def test_threads_end_before_the_interpreter():
     code = """
 import atexit, threading

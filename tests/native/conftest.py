@@ -5,20 +5,20 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from cameras import slow_unless
 
 from camtorch.native import build as building
-from camtorch.native.library import library
+from camtorch.native.library import library, native_available
 
 HERE = Path(__file__).parent
 SANITIZERS = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
 
+BEST = library().camtorch_variant().decode() if native_available() else "baseline"
 
-FASTER = [name for name in building.VARIANTS if name != "baseline"]
 
-
-@pytest.fixture(params=[pytest.param("baseline", marks=pytest.mark.slow if FASTER else ()), *FASTER])
+@pytest.fixture(params=slow_unless(BEST.__eq__, building.VARIANTS))
 def each_variant(request):
-    """The variants that this CPU runs, one after the other in the place of the one that is used."""
+    """The variants that this CPU runs, one after the other in the place of the best one, which is used."""
     native = library()
     used = native.camtorch_variant()
     if not native.camtorch_use(request.param.encode()):

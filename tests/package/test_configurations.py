@@ -13,7 +13,6 @@ jsonargparse = pytest.importorskip("jsonargparse")
 hydra = pytest.importorskip("hydra.utils")
 safetensors = pytest.importorskip("safetensors.torch")
 hub = pytest.importorskip("huggingface_hub")
-tensordict = pytest.importorskip("tensordict")
 
 CAMERA = ct.KannalaBrandt([60.0, 60, 31.5, 23.5], [0.1, 0.02, 0.003, 0.001], image_size=(48, 64))
 SAMPLE = {
@@ -93,6 +92,7 @@ def file(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("case", CASES, ids=[path for path, _ in CASES])
 def test_configurations_and_tensordicts_are_as_by_hand(case):
+    tensordict = pytest.importorskip("tensordict")
     transform, batch = made(case, by_hand), {name: value[None] for name, value in SAMPLE.items()}
     alone = moved(transform)
     for got, want in (

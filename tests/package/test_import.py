@@ -11,6 +11,7 @@ import torch
 import camtorch as ct
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+LENSES = pytest.param(["lenses", "gopro"], marks=pytest.mark.slow)
 
 
 def python(code, *words, expect=0):
@@ -19,7 +20,7 @@ def python(code, *words, expect=0):
     return done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("words", [["--version"], ["dewarp", "--help"], ["dewarp", "--fov", "x"], ["lenses", "gopro"]])
+@pytest.mark.parametrize("words", [["--version"], ["dewarp", "--help"], ["dewarp", "--fov", "x"], LENSES])
 def test_the_command_imports_what_it_needs(words):
     code = """
 import gc, sys
