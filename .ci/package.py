@@ -50,7 +50,7 @@ def build(python: Path, folder: Path, work: Path) -> tuple[Path, Path, Path | No
     (native,) = work.glob("*.whl")
     if platform.system() == "Linux":  # named after the oldest C library that it runs with, as indices ask for
         tools = f"{python.parent}{os.pathsep}{os.environ['PATH']}"
-        run(python, "-m", "auditwheel", "repair", "--wheel-dir", folder, native, PATH=tools)
+        run(python, "-m", "auditwheel", "repair", "--strip", "-z", "9", "--wheel-dir", folder, native, PATH=tools)
     else:
         shutil.copy(native, folder)
     (native,) = set(folder.glob("*.whl")) - {pure}

@@ -17,8 +17,10 @@ LONG = ("labels: ShutterWarp", "Reproject, sweep", "losses.rays")
 NOT_EXPORTED = (*INSIDE, *REFUSED, *LONG, "FaceNormalizer", "CanonicalCamera", "CameraHead", "labels: Plane")
 """Calls that torch.export refuses, or takes longest for."""
 LONG_COMPILED = ("CameraHead", "Compose: mount", "Compose: crop, mount", "Compose: flip, lens", "FaceNormalizer")
-LONG_COMPILED += ("RandomCamera", "RandomLens", "ShutterWarp", "labels: PlaneWarp", "labels: ShutterWarp")
-"""Calls that torch.compile traces for long; its second trace (AOTAutograd) sees the like in RandomMount and Warp."""
+LONG_COMPILED += ("RandomCamera", "RandomLens", "ShutterWarp", "labels:", "CenterCrop", "Compose: crop, crop")
+LONG_COMPILED += ("Compose: crop, flip", "Compose: size", "RandomCrop", "RandomResized", "Resize,", "Rotate90")
+LONG_COMPILED += ("VerticalFlip",)
+"""Calls that torch.compile traces for long; its second trace (AOTAutograd) sees the like in others, as RandomMount."""
 NAMES = slow_unless("Warp, bilinear, zeros".__eq__, [name for name in cases.CASES if name not in REFUSED])
 every = pytest.mark.parametrize("name", NAMES)
 
