@@ -86,12 +86,11 @@ def _map(commands: Commands) -> None:
 
 
 def _convert(commands: Commands) -> None:
-    command = commands.add_parser(
+    add = commands.add_parser(
         "convert",
         help="write a calibration as another camera model, or in another format",
         description="Write the cameras of a calibration file as cameras of another model, and print how good that is.",
-    )
-    add = command.add_argument
+    ).add_argument
     add("input", type=words.path, metavar="IN", help="a calibration file")
     add("new", type=words.path, nargs="?", metavar="OUT", help="the new one")
     add("-o", "--output", type=words.path, metavar="OUT", help="the same, as of other commands")
@@ -119,13 +118,12 @@ def _show(commands: Commands) -> None:
 
 
 def _lenses(commands: Commands) -> None:
-    command = commands.add_parser(
+    add = commands.add_parser(
         "lenses",
         help="find a real lens by its name",
         description="List calibrated lenses by words of their names, best first: camtorch lenses GoPro HERO9 wide. "
         "Other commands take the first of a list as --lens 'GoPro HERO9 wide'.",
-    )
-    add = command.add_argument
+    ).add_argument
     add("words", nargs="+", metavar="WORD", help="of brand, camera, lens and setting, in any order")
     add("--size", type=words.size, metavar="WxH", help="of images: only lenses of that aspect ratio, scaled to it")
     add("-n", type=words.count(100000), default=10, metavar="N", help="how many are listed at most; 10 by default")

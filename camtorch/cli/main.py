@@ -57,7 +57,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         module = f"camtorch.cli.{arguments.command}"
         if arguments.command == "dewarp" and arguments.jobs != 1 and commands.are_several(arguments.image):
             processes.prepare(module)  # processes import in parallel with this one
-        command = _imported(module)
+        if "torch" not in sys.modules:  # its import takes a second, and half of one more if garbage is collected
+            gc.disable()
+        try:
+            command = importlib.import_module(module)
+        finally:
+            if not gc.isenabled():
+                gc.freeze()  # the modules stay
+                gc.enable()
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             status: int = command.run(arguments) or 0
@@ -76,18 +83,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         say(f"error: {reason(error)}")
         return 2
     return status
-
-
-def _imported(module: str) -> Any:
-    """Import a command and torch: a second, which `--help` saves, and half of one more if garbage is collected."""
-    if "torch" in sys.modules:
-        return importlib.import_module(module)
-    gc.disable()
-    try:
-        return importlib.import_module(module)
-    finally:
-        gc.freeze()  # the modules stay
-        gc.enable()
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -52,6 +52,17 @@ _MOST_WORDS = 32
 _LINE = re.compile(rb"^[^\S\n]*([^\s#][^\n]*)", re.MULTILINE)  # skips comments
 _CAMERA = re.compile(rb"\d+\s+[A-Z][A-Z0-9_]*\s+\d+\s+\d+(?:\s|$)")
 
+_CAMERAS = """\
+# Camera list with one line of data per camera:
+#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
+# Number of cameras: {}
+"""
+_IMAGES = """\
+# Image list with two lines of data per image:
+#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME
+#   POINTS2D[] as (X, Y, POINT3D_ID)
+# Number of images: {}, mean observations per image: 0
+"""
 _HEAD = struct.Struct("<I7dI")
 _POINT = 24  # x, y and the id of a 3D point
 _LONGEST_NAME = 4096
@@ -71,7 +82,25 @@ def _is_binary(path: str, content: bytes) -> bool:
 
 def read(path: str, content: bytes) -> Rig:
     """Return the cameras by their ids, and the poses of the images in the same folder by the names of the images."""
-    cameras = _from_bytes(path, content) if _is_binary(path, content) else _from_text(path, content)
+    cameras: dict[str, Camera] = {}
+    for record, identity, name, size, values in (_from_bytes if _is_binary(path, content) else _from_text)(
+        path, content
+    ):
+        _, key, focals, _ = _MODELS[name]
+        if str(identity) in cameras:
+            record.fail(f"camera ids must be unique; got {identity} twice")
+        record.few(len(cameras))
+        if len(values) != _parameters(name):
+            record.fail(f"{name} must have {_parameters(name)} parameters; got {len(values)}")
+        if key == "equirectangular":
+            if values != [size[1], size[0]]:
+                record.fail(f"a panorama must be as large as its image, {size[1]} x {size[0]}; got {values}")
+            intrinsics, distortion = panorama(size), []
+        else:
+            cx, cy, *distortion = values[focals:]
+            intrinsics = [values[0], values[focals - 1], cx - 0.5, cy - 0.5]
+            distortion += [0.0] * (_COUNTS.get(name, 0) - len(distortion))
+        cameras[str(identity)] = record.camera(key, intrinsics, distortion, size)
     beside = _images_beside(path)
     if beside is None or not os.path.exists(beside):
         return Rig(cameras)
@@ -91,8 +120,10 @@ def _images_beside(path: str) -> str | None:
     return os.path.join(folder, f"images{suffix}") if stem == "cameras" else None
 
 
-def _from_text(path: str, content: bytes) -> dict[str, Camera]:
-    cameras: dict[str, Camera] = {}
+_Entry = tuple[Record, int, str, tuple[int, int], list[float]]  # place, id, model, size and parameters of a camera
+
+
+def _from_text(path: str, content: bytes) -> Iterator[_Entry]:
     number, position = 1, 0
     for line in _LINE.finditer(content):
         number, position = number + content.count(b"\n", position, line.start()), line.start()
@@ -105,12 +136,10 @@ def _from_text(path: str, content: bytes) -> dict[str, Camera]:
             name.fail(f"the model must be one of {', '.join(_MODELS)}; got {name.value!r:.60}")
         size = height.side(), width.side()
         identity = first.whole(0, _LARGEST_ID, "camera id")
-        _add(cameras, identity, record, name.value, size, [value.number() for value in values])
-    return cameras
+        yield record, identity, name.value, size, [value.number() for value in values]
 
 
-def _from_bytes(path: str, content: bytes) -> dict[str, Camera]:
-    cameras: dict[str, Camera] = {}
+def _from_bytes(path: str, content: bytes) -> Iterator[_Entry]:
     record, position = Record(path, None, "byte 0"), 0
 
     def take(layout: str) -> tuple[Any, ...]:
@@ -130,36 +159,15 @@ def _from_bytes(path: str, content: bytes) -> dict[str, Camera]:
             record.fail(f"must be a camera id; got {identity}")
         size = Record(path, [str(width), str(height)], record.place).size()
         parameters = list(take(f"<{_parameters(name)}d"))
-        _add(cameras, identity, record, name, size, Record(path, parameters, record.place).numbers())
+        yield record, identity, name, size, Record(path, parameters, record.place).numbers()
     if position < len(content):
         rest = f"must end after the last camera; got {len(content) - position} bytes more"
         Record(path, None, f"byte {position}").fail(rest)
-    return cameras
 
 
 def _parameters(name: str) -> int:
     _, _, focals, count = _MODELS[name]
     return focals + 2 + count
-
-
-def _add(
-    cameras: dict[str, Camera], identity: int, record: Record, name: str, size: tuple[int, int], values: list[float]
-) -> None:
-    _, key, focals, _ = _MODELS[name]
-    if str(identity) in cameras:
-        record.fail(f"camera ids must be unique; got {identity} twice")
-    record.few(len(cameras))
-    if len(values) != _parameters(name):
-        record.fail(f"{name} must have {_parameters(name)} parameters; got {len(values)}")
-    if key == "equirectangular":
-        if values != [size[1], size[0]]:
-            record.fail(f"a panorama must be as large as its image, {size[1]} x {size[0]}; got {values}")
-        intrinsics, distortion = panorama(size), []
-    else:
-        cx, cy, *distortion = values[focals:]
-        intrinsics = [values[0], values[focals - 1], cx - 0.5, cy - 0.5]
-        distortion += [0.0] * (_COUNTS.get(name, 0) - len(distortion))
-    cameras[str(identity)] = record.camera(key, intrinsics, distortion, size)
 
 
 def _read_images(path: str) -> tuple[dict[str, str], np.ndarray, bool, Callable[[int], Record]]:
@@ -246,22 +254,20 @@ def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
     if not all(0 <= i <= _LARGEST_ID for i in ids):
         ids = list(range(1, len(ids) + 1))
     identities = dict(zip(rig.cameras, ids, strict=True))
-    blocks = [struct.pack("<Q", len(ids))]
-    lines = [
-        "# Camera list with one line of data per camera:",
-        "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
-        f"# Number of cameras: {len(ids)}",
-    ]
-    for name, camera in rig.cameras.items():
-        height, width = lossy.size(name, camera)
-        model, values = _smallest(lossy, name, camera)
-        layout = f"<IiQQ{len(values)}d"
-        blocks.append(struct.pack(layout, identities[name], _MODELS[model][0], width, height, *values))
-        lines.append(f"{identities[name]} {model} {width} {height} {' '.join(map(number, values))}")
     if not (path := lossy.path).endswith(NAMES.suffixes):  # a folder that does not exist yet
         path = os.path.join(path, "cameras.txt")
     binary = path.endswith(".bin")
-    contents = {path: b"".join(blocks) if binary else _text_of(lines)}
+    blocks = [struct.pack("<Q", len(ids)) if binary else _CAMERAS.format(len(ids)).encode()]
+    for name, camera in rig.cameras.items():
+        height, width = lossy.size(name, camera)
+        model, values = _smallest(lossy, name, camera)
+        if binary:
+            layout = f"<IiQQ{len(values)}d"
+            blocks.append(struct.pack(layout, identities[name], _MODELS[model][0], width, height, *values))
+        else:
+            line = f"{identities[name]} {model} {width} {height} {' '.join(map(number, values))}\n"
+            blocks.append(line.encode())
+    contents = {path: b"".join(blocks)}
     beside = _images_beside(path)
     suffix = os.path.splitext(path)[1]
     if rig.extrinsics:
@@ -298,35 +304,24 @@ def _smallest(lossy: Lossy, name: str, camera: Camera) -> tuple[str, list[float]
     return model, [*(fx, fy)[: _MODELS[model][2]], cx + 0.5, cy + 0.5, *values]
 
 
-def _text_of(lines: list[str]) -> bytes:
-    return ("\n".join(lines) + "\n").encode()
-
-
 def _images_content(lossy: Lossy, rig: Rig, identities: dict[str, int], path: str, binary: bool) -> bytes:
     """Return the file of a rig's poses; refuse to overwrite a file with points."""
-    entries = []
-    for name, values in zip(rig.extrinsics, poses.quaternions(poses.all_of(rig, lossy)).tolist(), strict=True):
+    count = len(rig.extrinsics)
+    blocks = [struct.pack("<Q", count) if binary else _IMAGES.format(count).encode()]
+    rows = poses.quaternions(poses.all_of(rig, lossy)).tolist()
+    for i, (name, values) in enumerate(zip(rig.extrinsics, rows, strict=True), 1):
         if not name or "\0" in name or (not binary and (name.split() != [name])):
             hint = "" if binary else ". Write .bin, which holds it"
             lossy.fail(repr(name), f"must be a name that COLMAP reads; got another{hint}")
-        entries.append((name, identities[rig.images.get(name, name)], values))
+        camera = identities[rig.images.get(name, name)]
+        if binary:  # names end with a zero byte, and the number of points is 0
+            blocks.append(_HEAD.pack(i, *values, camera) + name.encode() + bytes(9))
+        else:
+            blocks.append(f"{i} {' '.join(map(number, values))} {camera} {name}\n\n".encode())
     if os.path.exists(path) and _read_images(path)[2]:
         Record(path, None).fail("must hold no points, which would be lost; got some. Write to another folder")
     folder, suffix = os.path.dirname(path), os.path.splitext(path)[1]
     for name in ("rigs", "frames"):
         if os.path.exists(os.path.join(folder, name + suffix)):
             lossy.fail("extrinsics", f"must agree with {name}{suffix} there; got others. Write to another folder")
-    if binary:
-        blocks = [
-            _HEAD.pack(i, *row, camera) + name.encode() + bytes(9) for i, (name, camera, row) in enumerate(entries, 1)
-        ]
-        return struct.pack("<Q", len(blocks)) + b"".join(blocks)  # names end with a zero byte; no points
-    lines = [
-        "# Image list with two lines of data per image:",
-        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
-        "#   POINTS2D[] as (X, Y, POINT3D_ID)",
-        f"# Number of images: {len(entries)}, mean observations per image: 0",
-    ]
-    for i, (name, camera, values) in enumerate(entries, 1):
-        lines += [f"{i} {' '.join(map(number, values))} {camera} {name}", ""]
-    return _text_of(lines)
+    return b"".join(blocks)
