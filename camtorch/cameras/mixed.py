@@ -5,7 +5,6 @@ from __future__ import annotations
 import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 
@@ -231,14 +230,11 @@ class Mixed(Camera):
     def expand(self, *batch: int | Sequence[int]) -> Self:
         """Expand like `Camera.expand`: a batch of one becomes one of many, any other one keeps its dim."""
         sizes: Any = batch[0] if len(batch) == 1 and isinstance(batch[0], Sequence) else batch
-        count, size = len(self), None
-        with suppress(TypeError, RuntimeError):
-            size = operator.index(sizes[0]) if len(sizes) == 1 else None
-        if size in (count, -1):
+        if tuple(sizes) in ((len(self),), (-1,)):
             return self
-        if count != 1 or size is None or size < 1:
-            raise ValueError(f"Mixed: batch must fit dims ({count},); got {shown(tuple(sizes))}")
-        return type(self)([self.groups[0][1].expand(size)])
+        if len(self) != 1 or len(sizes) != 1:
+            raise ValueError(f"Mixed: batch must fit dims ({len(self)},); got {shown(tuple(sizes))}")
+        return type(self)([self.groups[0][1].expand(sizes)])
 
     def replace(
         self,

@@ -33,7 +33,6 @@ _Checked = tuple[Tensor, Tensor, tuple[str, ...], torch.Size, tuple[int, int] | 
 
 _OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
 _DTYPES, _NUMBERS = (torch.float32, torch.float64), {float, int}
-_NO_BATCH = torch.Size()
 _LARGE = 1e30  # float32 can hold it, and NaN is not below it
 _SIZE_LIKE = 32  # px; two whole coefficients from here on are an image size
 _LOOKED_AT = 64  # cameras of a batch that are checked: a wrong order is in all of them
@@ -89,7 +88,7 @@ def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: 
             return None
         if not _off_centre(rows[0][2], rows[0][3], size) <= _CENTRED:
             return None
-    return made[0], made[1], names, _NO_BATCH, size
+    return made[0], made[1], names, torch.Size(), size
 
 
 _names_of = functools.lru_cache(maxsize=256)(lambda model, count: model.names_of(count))
@@ -186,15 +185,12 @@ def unstack_numbers(intrinsics: Tensor, xp: Any) -> Iterable[Any]:
     return intrinsics.tolist() if intrinsics.ndim == 1 else intrinsics.detach().double().numpy().T
 
 
-_FLOATS = {float, np.float64}
-
-
 def stack_numbers(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
     """Return (*B, n) for n tensors (*B,), or for numbers and arrays, in the dtype of a tensor."""
     if xp is torch:
         return torch.stack(torch.broadcast_tensors(*numbers), -1).to(like.dtype)
     kind = np.float64 if like.dtype == torch.float64 else np.float32
-    if _FLOATS.issuperset(map(type, numbers)):
+    if {float, np.float64}.issuperset(map(type, numbers)):
         return torch.from_numpy(np.array(numbers, kind))
     return torch.from_numpy(np.stack(np.broadcast_arrays(*numbers), -1).astype(kind, copy=False))
 

@@ -21,13 +21,11 @@ class Kept:
     values may not be read. Copies and pickles begin empty.
     """
 
-    capacity: int = 1
     result: Any = None  # the one that was returned last, for any inputs
     _kept: Sequence[tuple[tuple[Any, ...], list[Note], Any]] = ()  # the last one used is first
 
     def __init__(self, capacity: int = 1) -> None:
-        if capacity != 1:
-            self.capacity = capacity
+        self.capacity = capacity
 
     def __call__(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], T]) -> T:
         """Return `compute()` without a graph, or its kept result; it depends on the tensors `inputs` and `options`."""

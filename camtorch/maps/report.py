@@ -36,7 +36,6 @@ class MapReport:
     """Other facts that a user of the map needs by name, such as "step", "nodes" or "block_size"."""
 
     def __str__(self) -> str:
-        """Return one line, as the command line prints it."""
         (rows, columns), (height, width) = self.source_size, self.target_size
         part = 100 * self.shown / (height * width)
         stray = f"; {self.stray} pixels are drawn that the warp leaves empty" if self.stray else ""

@@ -15,9 +15,9 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import CameraNumbers, opaque
 from camtorch.evaluate.kept import Kept
 from camtorch.native.sampler import layout
-from camtorch.values.arguments import broadcast_shapes, one_of
+from camtorch.values.arguments import broadcast_shapes
 from camtorch.warp.grid import locate, tabulate
-from camtorch.warp.sampling import MODES, PADDINGS, Sampler, render
+from camtorch.warp.sampling import Sampler, render
 
 
 def _count(rotation: Tensor | None, *numbers: Tensor) -> int:
@@ -99,6 +99,6 @@ def _warp(
     found = partial(locate, source, target, rotation, tolerance, antialias == "True", every, padding)
     inputs = [*source._tensors, *target._tensors, *([] if rotation is None else [rotation])]
     where = _located(inputs, (source._form, target._form, tolerance, antialias, padding, rotation is None), found)
-    how = one_of(mode, MODES, "mode", "Warp"), one_of(padding_mode, PADDINGS, "padding_mode", "Warp")
+    how: tuple[Any, Any] = mode, padding_mode
     values = tuple(ast.literal_eval(f"({fill},)"))
     return (laid(render(images, where, *how, values), is_last),)

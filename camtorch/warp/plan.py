@@ -78,7 +78,6 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]  # (height, width) of the source
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
 _STRIP = 1 << 21  # pixels of such a strip
 _HEAD, _WIDTHS = 7, {"pixels": 22, "turned": 8, "images": 38}  # words of the structures of C
-_MOST_FORMS = 4  # of samples that a thread keeps calls of
 _FEW = 2  # tiles of an image that one thread makes alone
 _EVEN = 4  # samples a thread from which on it matters little that the last ones leave some threads idle
 _PIXELS = 1 << 3  # flags of what is left of pixels are times this
@@ -319,11 +318,11 @@ def call_for(
             return None
     given = sizes, dtype, tolerance, antialias is None, batched
     forms = [(t.shape, t.stride(), t.dtype, how) for t, how in zip(values, hows, strict=True)]
-    calls: Kept = _calls.__dict__.setdefault("kept", Kept(_MOST_FORMS))
+    calls: Kept = _calls.__dict__.setdefault("kept", Kept(4))
     return calls((), (*given, *forms), lambda: SampleCall.of(SampleForm(*given, count, values, hows)))
 
 
-_calls = threading.local()  # a thread's calls have memory of their own
+_calls = threading.local()  # a thread keeps calls of its last four forms, which have memory of their own
 
 
 @functools.lru_cache(maxsize=16)

@@ -203,7 +203,9 @@ class ShutterWarp(MirrorWarp):
 
     @property
     def _ends(self) -> tuple[Camera, Camera]:
-        return _behind(self.shutter, self.source), _behind(self.target_shutter, self.target)
+        pairs = (self.shutter, self.source), (self.target_shutter, self.target)
+        source, target = (camera if each is None else cast("Camera", InMotion(camera, each)) for each, camera in pairs)
+        return source, target
 
     def inverse(self) -> Warp:
         """Return the warp from target to source. It applies the shutter that this one undoes, and undoes the other."""
@@ -230,10 +232,6 @@ class ShutterWarp(MirrorWarp):
         both = {"shutter": self.shutter, "target_shutter": self.target_shutter}
         shutters: Any = {name: None if each is None else change(each) for name, each in both.items()}
         return self.between(*between, **self.options, **shutters)
-
-
-def _behind(shutter: RollingShutter | None, camera: Camera) -> Camera:
-    return camera if shutter is None else cast("Camera", InMotion(camera, shutter))
 
 
 class InMotion:

@@ -70,11 +70,9 @@ class Views(GeometryModule):
         self.backs = nn.ModuleList([Warp(view, camera, r.mT, mode=mode, padding_mode="border") for r in rotations])
 
     def __len__(self) -> int:
-        """Return the number of views."""
         return len(self.names)
 
     def __iter__(self) -> Iterator[Warp]:
-        """Iterate over the warps."""
         return iter(self.warps)  # type: ignore[arg-type]
 
     def forward(self, images: Any) -> Any:

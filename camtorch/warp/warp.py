@@ -106,7 +106,6 @@ class Warp(CameraPair):
     ):
         options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
         rotation = as_rotation(rotation, "Warp")
-        # find the one batch dim of all, and raise if something is wrong
         as_sized(source, "source", "Warp")
         as_sized(target, "target", "Warp")
         check_devices("Warp", source=source.intrinsics, target=target.intrinsics, rotation=rotation)
