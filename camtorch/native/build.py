@@ -52,6 +52,11 @@ class BuildError(RuntimeError):
     """Raised if there is no C compiler, or if it fails, with its command and output."""
 
 
+def switched_off() -> bool:
+    """Whether the environment has `CAMTORCH_NATIVE=0`."""
+    return os.environ.get("CAMTORCH_NATIVE", "").strip().lower() in ("0", "off", "false")
+
+
 def checksum(sources: str | os.PathLike[str] = _HERE) -> int | None:
     """Return a checksum of the C files in a folder, or None if it has none; a library holds that of its sources."""
     texts = [path.read_bytes() for path in sorted(Path(sources).glob("*.[ch]"))]

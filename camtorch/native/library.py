@@ -8,7 +8,7 @@ import os
 import warnings
 from pathlib import Path
 
-from camtorch.native.build import LIBRARY, REASON, VARIANTS, checksum
+from camtorch.native.build import LIBRARY, REASON, VARIANTS, checksum, switched_off
 
 _HERE = Path(__file__).resolve().parent
 _BUILD = "python -m camtorch.native.build"
@@ -17,7 +17,7 @@ _BUILD = "python -m camtorch.native.build"
 @functools.cache
 def _find() -> tuple[ctypes.CDLL | None, str, bool]:
     """Return the library, its CPU's kind or why there is none, and whether it is there but stale."""
-    if os.environ.get("CAMTORCH_NATIVE", "").strip().lower() in ("0", "off", "false"):
+    if switched_off():
         return None, "off (CAMTORCH_NATIVE=0)", False
     path = _HERE / LIBRARY
     if not path.exists():
