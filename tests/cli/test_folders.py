@@ -206,7 +206,7 @@ def started(*words, **options):
 
 
 def group_has_ended(number):
-    for _ in range(300):
+    for _ in range(1200):  # the first process of a machine may be slow to reap
         try:
             os.killpg(number, 0)
         except ProcessLookupError:
