@@ -71,7 +71,7 @@ def rows_of(record: Record) -> list[list[float]]:
     if len(record) not in (3, 4):
         record.fail(f"must have 3 rows; got {len(record)}")
     rows = [row.numbers(4) for row in record]
-    if rows[3:] and rows[3] != [0, 0, 0, 1]:
+    if rows[3:] and max(abs(a - b) for a, b in zip(rows[3], (0, 0, 0, 1), strict=True)) > 1e-5:
         record.fail(f"the last row must be 0 0 0 1; got {rows[3]}")
     return [*rows[:3], [0.0, 0.0, 0.0, 1.0]]
 

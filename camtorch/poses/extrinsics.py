@@ -133,7 +133,7 @@ class Extrinsics(BatchedModule):
                     f"Extrinsics: matrix must be (*B, 4, 4) or (*B, 3, 4); got shape {tuple(matrix.shape)}{hint}"
                 )
             bottom = matrix[..., 3:, :].detach()
-            if known_false(bottom == bottom.new_tensor([0, 0, 0, 1])):
+            if known_false((bottom - bottom.new_tensor([0, 0, 0, 1])).abs() < 1e-5):  # rounding of an inverse
                 raise ValueError(f"Extrinsics: the last row of matrix must be 0 0 0 1; got {bottom.tolist()}")
             rotation, translation = matrix[..., :3, :3], matrix[..., :3, 3]
         check_rotation(rotation, "matrix", "Extrinsics")

@@ -186,6 +186,7 @@ def test_what_is_more_than_its_bytes_goes_torchs_way(monkeypatch, name):
         """Whose batches are made by a function of somebody's own."""
 
     monkeypatch.setitem(default_collate_fn_map, Odd, lambda batch, *, collate_fn_map=None: UNLIKE[name]())
-    value = next(iter(DataLoader([Odd()] * 2, 2, num_workers=1, collate_fn=collate, timeout=30)))
+    options = {"collate_fn": collate, "timeout": 30, "multiprocessing_context": "fork"}
+    value = next(iter(DataLoader([Odd()] * 2, 2, num_workers=1, **options)))
     assert value.layout == UNLIKE[name]().layout
     assert value.requires_grad == (name == "learns")

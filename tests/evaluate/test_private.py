@@ -14,7 +14,7 @@ from camtorch.evaluate import door
 from camtorch.evaluate.kept import note, same
 
 # newer ones warn of what they still do
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.trace` is deprecated:FutureWarning")
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.trace`:FutureWarning")
 
 
 class Passes(TorchDispatchMode):
