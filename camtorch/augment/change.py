@@ -62,7 +62,7 @@ class Drawn:
     def target(self) -> Camera:
         """The one of the change, which nobody else gets."""
         if self.native is not None:
-            self.native.keep_lenses()
+            _ = self.native.lenses  # kept for cameras of the same numbers
         return self.camera()
 
     def camera(self) -> Camera:

@@ -139,7 +139,7 @@ class Start:
             return  # others make these
         if plan.has_stages:
             call.domain = lenses.asked
-            if not plan.has_fixed_ends(native.dtype):
+            if native.dtype not in plan.fixed_ends:
                 return
             for name, radii in lenses.radii_wanted().items():
                 setattr(call.domain, name, self._keep(radii))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -180,33 +180,25 @@ def _own(given: Any, name: str, otherwise: Any) -> Any:
     return given.get(name, otherwise) if isinstance(given, Mapping) else given
 
 
-class _Alone(NamedTuple):
-    """A camera calibrated alone: parameters (1, 4 + n), boards' poses (1, V), and whether it has these, bool (V,)."""
-
-    parameters: Tensor
-    boards: Poses
-    has_pose: Tensor
-
-
 def _join_starts(searches: list[Search], observed: list[CameraObservations], free: Free) -> State:
     """Return the start: mounts from pairs that see the same boards, boards from the camera that sees each best."""
-    alone = []
-    for search in searches:
-        has_pose = search.given.seen.any(-1)
-        state = replace(search, given=search.given.of(has_pose)).alone().state
-        boards = Poses.none(1, len(has_pose), search.given.pixels).with_views(has_pose.nonzero()[:, 0], state.boards)
-        alone.append(_Alone(state.parameters[0], boards, has_pose))
-    mounts = Poses.none(1, len(alone), alone[0].parameters)
+    has_pose, states = [search.given.seen.any(-1) for search in searches], []
+    for search, has in zip(searches, has_pose, strict=True):
+        state = replace(search, given=search.given.of(has)).alone().state
+        boards = Poses.none(1, len(has), search.given.pixels).with_views(has.nonzero()[:, 0], state.boards)
+        states.append(state._replace(boards=boards))
+    parameters = tuple(state.parameters[0] for state in states)
+    mounts = Poses.none(1, len(states), parameters[0])
     turns, shifts = mounts.rotations[0], mounts.translations[0]
-    together = torch.stack([one.has_pose for one in alone]).double()
+    together = torch.stack(has_pose).double()
     together = together @ together.mT
     known = [0]
-    while len(known) < len(alone):
-        rest = [c for c in range(len(alone)) if c not in known]
+    while len(known) < len(states):
+        rest = [c for c in range(len(states)) if c not in known]
         i, j = divmod(int(together[known][:, rest].argmax()), len(rest))
         a, b = known[i], rest[j]
-        both = alone[a].has_pose & alone[b].has_pose
-        (from_a, at_a), (from_b, at_b) = ((t[0, both] for t in alone[c].boards) for c in (a, b))
+        both = has_pose[a] & has_pose[b]
+        (from_a, at_a), (from_b, at_b) = ((t[0, both] for t in states[c].boards) for c in (a, b))
         # from camera a to b: of all boards' poses, the one nearest to the others
         rotations = from_b @ from_a.mT
         translations = at_b - (rotations @ at_a[..., None])[..., 0]
@@ -217,15 +209,14 @@ def _join_starts(searches: list[Search], observed: list[CameraObservations], fre
         turns[b] = rotations[middle] @ turns[a]
         shifts[b] = rotations[middle] @ shifts[a] + translations[middle]
         known.append(b)
-    parameters = tuple(one.parameters for one in alone)
-    boards, least = alone[0].boards, torch.full_like(alone[0].boards.translations[0, :, 0], torch.inf)
-    for c, one in enumerate(alone):
+    boards, least = states[0].boards, torch.full_like(states[0].boards.translations[0, :, 0], torch.inf)
+    for c, one in enumerate(states):
         own = Poses(turns[c].mT @ one.boards.rotations, (one.boards.translations - shifts[c]) @ turns[c])
         state = State(parameters, mounts, own, own.translations.new_zeros(1, 2))
         bundle = Bundle(observed, state, free, "cauchy", 1.0)
         flat = bundle.flat(state)
         cost = torch.stack([bundle.errors_of(k, flat).cost[0] for k in range(len(observed))]).sum(0)
-        better = one.has_pose & (cost < least)
+        better = has_pose[c] & (cost < least)
         least = torch.where(better, cost, least)
         boards = Poses.where(better, own, boards)
     return State(parameters, mounts, boards, least.new_zeros(1, 2))

@@ -33,10 +33,6 @@ class Inverted(Chart):
         self._known: RadialInverse | None = None
 
     @property
-    def _radial(self) -> RadialFactor:
-        return self.factor(self.parameters)
-
-    @property
     def _inverse(self) -> RadialInverse:
         """The inverse with its tables, without a graph, made at first use; compiled code may keep nothing."""
         if torch.compiler.is_compiling() and not is_portable_export():
@@ -61,7 +57,7 @@ class Inverted(Chart):
             t = theta2.detach() * scale * scale
             factor, slope = self._inverse.radial.derivatives(t, 1)
             step = torch.addcmul(factor, t, slope, value=2).reciprocal()
-        radial = self._radial
+        radial = self.factor(self.parameters)
         for _ in range(max(order, 1)):
             scale = scale + (1 - scale * radial(theta2 * scale * scale)) * step
         return angle * scale
@@ -79,7 +75,7 @@ class Inverted(Chart):
         return self.on_plane(a, b)
 
     def to_ray(self, a: Tensor, b: Tensor, order: int = 2) -> Planes3:
-        factor = self._radial(torch.addcmul(a * a, b, b))
+        factor = self.factor(self.parameters)(torch.addcmul(a * a, b, b))
         return Equidistant().to_ray(a * factor, b * factor, order)
 
     def end(self, dtype: torch.dtype) -> float | Tensor:

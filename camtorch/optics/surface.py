@@ -24,8 +24,17 @@ class SurfaceAt(StageAt):
 
     def __init__(self, stage: Surface, a: Tensor, b: Tensor):
         super().__init__(stage, a, b)
+        # control points (..., order + 1, order + 1, 2), rows first, and weights and slopes along a and b;
         # computed at once: torch.compile cannot enter the lock that cached_property has before Python 3.12
-        self._patch = self._at_points()
+        controls = stage.parameters
+        points = torch.stack(controls, -1).unflatten(-1, (len(controls) // 2, 2)).flatten(0, -2)
+        (i, wa, da), (j, wb, db) = self._place(0), self._place(1)
+        # each camera, or point, has its own
+        first = (torch.ones_like(controls[0], dtype=torch.int64).flatten().cumsum(0) - 1).view(controls[0].shape)
+        index = first * (stage.columns * stage.rows) + j * stage.columns + i
+        steps = torch.arange(stage.order + 1, device=index.device)
+        index = index[..., None, None] + steps[:, None] * stage.columns + steps
+        self._patch = points.index_select(0, index.flatten()).view(*index.shape, 2), wa, da, wb, db
 
     def _place(self, axis: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return the first of the control points that contribute, weights (..., order + 1), and their slopes."""
@@ -42,19 +51,6 @@ class SurfaceAt(StageAt):
             return cell.long() - 1, torch.stack(weights, -1) / 6, torch.stack(slopes, -1)
         few = (4 * x - 4) * x + 1, 6 - 8 * x * x, (4 * x + 4) * x + 1
         return cell.long() - 1, torch.stack(few, -1) / 8, torch.stack((x - 0.5, -2 * x, x + 0.5), -1)
-
-    def _at_points(self) -> tuple[Tensor, ...]:
-        """Return control points (..., order + 1, order + 1, 2), rows first, and weights and slopes along a and b."""
-        stage = self.stage
-        controls = stage.parameters
-        points = torch.stack(controls, -1).unflatten(-1, (len(controls) // 2, 2)).flatten(0, -2)
-        (i, wa, da), (j, wb, db) = self._place(0), self._place(1)
-        # each camera, or point, has its own
-        first = (torch.ones_like(controls[0], dtype=torch.int64).flatten().cumsum(0) - 1).view(controls[0].shape)
-        index = first * (stage.columns * stage.rows) + j * stage.columns + i
-        steps = torch.arange(stage.order + 1, device=index.device)
-        index = index[..., None, None] + steps[:, None] * stage.columns + steps
-        return points.index_select(0, index.flatten()).view(*index.shape, 2), wa, da, wb, db
 
     @staticmethod
     def _sum(patch: Tensor, along: Tensor, down: Tensor) -> Planes2:

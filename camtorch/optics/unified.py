@@ -67,7 +67,7 @@ class Unified(Chart):
         xi, alpha, _ = self._parts()
         rho2, shifted, sphere, distance = self._shifted(x, y, z)
         below = self._below(rho2, shifted, sphere)
-        margin = self._most(z.dtype) * below - torch.maximum(x.abs(), y.abs())
+        margin = Perspective().end(z.dtype) * below - torch.maximum(x.abs(), y.abs())
         margin = torch.minimum(margin, alpha * shifted + (1 - alpha) * sphere)
         return margin if xi is None or distance is None else torch.minimum(margin, torch.addcmul(distance, xi, z))
 
@@ -81,7 +81,7 @@ class Unified(Chart):
         around = rho2 if beta is None else rho2 * beta
         # stay away from the fold, which the ray's own rounding would cross
         floor = 64 * torch.finfo(a.dtype).eps
-        margin = self._most(a.dtype) / 2 - torch.maximum(a.abs(), b.abs())
+        margin = Perspective().end(a.dtype) / 2 - torch.maximum(a.abs(), b.abs())
         margin = torch.minimum(margin, 1 - floor - (2 * alpha - 1) * around)
         if xi is None:
             return margin
@@ -121,14 +121,9 @@ class Unified(Chart):
         below = torch.where(first, slope, 1 - alpha) + torch.where(first, 0.0, alpha) * root
         return above / below
 
-    @staticmethod
-    def _most(dtype: torch.dtype) -> float:
-        """Return a radius that no image has, and whose powers are still numbers."""
-        return Perspective().end(dtype)
-
     def end(self, dtype: torch.dtype) -> float | Tensor:
         xi, alpha, beta = self._parts()
-        most, inside = self._most(dtype) / 2, 1 - 64 * torch.finfo(dtype).eps
+        most, inside = Perspective().end(dtype) / 2, 1 - 64 * torch.finfo(dtype).eps
         if xi is None and not isinstance(alpha, Tensor):
             return min(most, inside / (2 * alpha - 1) ** 0.5) if alpha > 0.5 else most
         fold = (2 * alpha - 1) * (torch.ones_like(self.parameters[0]) if beta is None else beta)
@@ -146,7 +141,7 @@ class Unified(Chart):
 
     def radii(self, count: int, like: Tensor) -> Tensor:
         end = self.end(like.dtype)
-        most = self._most(like.dtype) / 2 if isinstance(end, Tensor) else end
+        most = Perspective().end(like.dtype) / 2 if isinstance(end, Tensor) else end
         if most < 2:
             return even_steps_and_ratios(count, most, most, like, torch.positive)
         return even_steps_and_ratios(count, math.radians(88), most, like, torch.tan)

@@ -88,24 +88,20 @@ class Plan:
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
         # a radial factor has so many numbers that its fold is not found by a root
         self.is_long = any(part.factor and part.n + part.m > _MOST_DEGREE for part in parts)
-        self._ends: dict[torch.dtype, tuple[float, float]] = {}
+        self.fixed_ends: dict[torch.dtype, tuple[float, float]] = {}  # if all cameras have them, after a call of `ends`
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
     def ends(self, chart: Callable[[], Chart], dtype: torch.dtype) -> tuple[float | Tensor, float | Tensor]:
         """Return the radii at which the chart of some cameras ends, and beyond which there are no images."""
         if self.is_chart:
             return FURTHEST, FURTHEST
-        if dtype in self._ends:
-            return self._ends[dtype]
+        if dtype in self.fixed_ends:
+            return self.fixed_ends[dtype]
         made = chart()
         end, usual_end = made.end(dtype), made.usual_end(dtype)
         if not (made.parameters or isinstance(end, Tensor) or isinstance(usual_end, Tensor)):
-            self._ends[dtype] = end, usual_end
+            self.fixed_ends[dtype] = end, usual_end
         return end, usual_end
-
-    def has_fixed_ends(self, dtype: torch.dtype) -> bool:
-        """Whether the chart of all cameras ends at one radius, after a call of `ends`."""
-        return dtype in self._ends
 
     def radii(self, chart: Callable[[], Chart], count: int, like: Tensor) -> Tensor:
         """Return the radii of the chart of some cameras, like `Chart.radii`, in double precision."""
@@ -317,10 +313,6 @@ class Native:
     def lenses(self) -> Lenses:
         """The lenses of the cameras, which other cameras may share."""
         return self._make_lenses(self)
-
-    def keep_lenses(self) -> None:
-        """Keep the lenses for cameras of the same numbers."""
-        _ = self.lenses
 
     def add_table(self) -> None:
         """Set the table from which the inverse of a radial factor starts."""

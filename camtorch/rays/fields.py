@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -100,22 +100,16 @@ def _broadcast(batch: torch.Size, other: torch.Size, name: str, owner: str) -> t
         ) from None
 
 
-class Tangents(NamedTuple):
-    """Unit rays (..., 3), their derivatives (..., 3) by the pixel to the right and down, and valid (...) bool."""
+def tangents(camera: CameraLike, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return unit rays of pixels (*B, *N, 2), their exact derivatives by the pixel to the right and down, and valid.
 
-    rays: Tensor
-    across: Tensor
-    down: Tensor
-    valid: Tensor
-
-
-def tangents(camera: CameraLike, pixels: Tensor) -> Tangents:
-    """Return rays of pixels (*B, *N, 2) and their exact derivatives, with a graph if the camera or pixels have one."""
+    They have a graph if the camera or pixels have one.
+    """
     if is_unknown(pixels):
         right, below = (pixels.new_tensor(unit).expand_as(pixels) for unit in ((1.0, 0.0), (0.0, 1.0)))
         by_u: Any = torch.func.jvp(camera.unproject, (pixels,), (right,), has_aux=True)
         by_v: Any = torch.func.jvp(camera.unproject, (pixels,), (below,), has_aux=True)
-        return Tangents(by_u[0], by_u[1], by_v[1], by_u[2])
+        return by_u[0], by_u[1], by_v[1], by_u[2]
     learns = torch.is_grad_enabled() and any(t.requires_grad for t in (pixels, *camera._tensors))
     with torch.inference_mode(False), torch.enable_grad():
         given = pixels if learns and pixels.requires_grad else pixels.detach().clone().requires_grad_()
@@ -125,19 +119,19 @@ def tangents(camera: CameraLike, pixels: Tensor) -> Tangents:
             for plane in rays.unbind(-1)
         ]
     across, down = torch.stack(by_pixel, -1).unbind(-2)
-    return Tangents(rays if learns else rays.detach(), across, down, valid)
+    return rays if learns else rays.detach(), across, down, valid
 
 
-def local_frames(at: Tangents) -> tuple[Tensor, Tensor, Tensor]:
+def local_frames(rays: Tensor, across: Tensor, down: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return rotations (..., 3, 3) to local frames, pixels per unit of their planes (..., 2, 2), and valid (...) bool.
 
     The local z axis is the ray, and x the direction in which the ray moves with a pixel to the right, so that the
     derivative of the plane by the pixel is upper triangular. Both are identities if they are not valid.
     """
-    turned = (torch.linalg.cross(at.across, at.down) * at.rays).sum(-1)
-    valid = at.valid & torch.isfinite(turned) & (turned > torch.finfo(turned.dtype).tiny)
+    turned = (torch.linalg.cross(across, down) * rays).sum(-1)
+    valid = valid & torch.isfinite(turned) & (turned > torch.finfo(turned.dtype).tiny)
     axes = torch.eye(3, dtype=turned.dtype, device=turned.device).roll(1, 0)
-    given = zip((at.rays, at.across, at.down), axes, strict=True)
+    given = zip((rays, across, down), axes, strict=True)
     z, across, down = (torch.where(valid[..., None], vector, axis) for vector, axis in given)
     wide = across.square().sum(-1).sqrt()
     x = across / wide[..., None]
@@ -151,7 +145,7 @@ def local_pinhole(camera: CameraLike, pixels: Numbers) -> tuple[Tensor, Tensor]:
     """Return rotations (..., 3, 3) and matrices K (..., 3, 3); see `Camera.local_pinhole`."""
     owner = f"{type(camera).__name__}.local_pinhole"
     pixels, _ = as_points(pixels, "pixels", 2, camera.batch_shape, camera._tensors, owner)
-    rotation, per_unit, valid = local_frames(tangents(camera, pixels))
+    rotation, per_unit, valid = local_frames(*tangents(camera, pixels))
     centre = torch.where(valid[..., None], pixels.to(per_unit.dtype), 0.0)
     top = torch.cat((per_unit, centre[..., None]), -1)
     bottom = top.new_tensor([0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 3)
@@ -168,7 +162,7 @@ def perspective_field(camera: CameraLike, gravity: Numbers, stride: int) -> tupl
     _broadcast(camera.batch_shape, down.shape[:-1], "gravity", owner)
 
     def field(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        frame, per_unit, valid = local_frames(tangents(camera, pixels))
+        frame, per_unit, valid = local_frames(*tangents(camera, pixels))
         upward = -down / down.square().sum(-1, keepdim=True).sqrt()
         seen = (frame * upward[..., None, None, None, :].to(frame.dtype)).sum(-1)  # x, y, z of the local frame
         across, along = seen[..., :2], seen[..., 2]
