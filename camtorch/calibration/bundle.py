@@ -126,7 +126,6 @@ class Adjusted:
     converged: Tensor  # (B,)
     residuals: tuple[Tensor, ...]  # of each camera (B, V, N, 2), projected minus observed
     valid: tuple[Tensor, ...]  # (B, V, N) bool, whether points, of any weight, have a pixel
-    weights: tuple[Tensor, ...]  # (B, V, N) of the squares at the end, with those of a robust loss
     problem: Bundle
 
     @cached_property
@@ -163,7 +162,6 @@ def adjust(
         found.converged,
         tuple(errors.residuals for errors in by_camera),
         tuple(problem.shown(c, found.state, errors) for c, errors in enumerate(by_camera)),
-        tuple(errors.weights for errors in by_camera),
         problem,
     )
 

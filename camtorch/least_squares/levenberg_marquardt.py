@@ -23,15 +23,12 @@ class Problem(Protocol):
 
     def cost(self, state: State, rows: Tensor) -> Tensor:
         """Return the costs (R,); infinite if a state is impossible."""
-        ...
 
     def linearised(self, state: State, rows: Tensor) -> System:
         """Return the linearised problem at a state of finite cost."""
-        ...
 
     def moved(self, state: State, step: State, rows: Tensor) -> State:
         """Return the state after a step."""
-        ...
 
 
 class Minimum(NamedTuple):

@@ -16,11 +16,10 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from camtorch.optics.charts import Planes2, Planes3
 from camtorch.optics.derivatives import jacobian_of
 from camtorch.optics.radial import RadialFactor
 
-Planes2 = tuple[Tensor, Tensor]
-Planes3 = tuple[Tensor, Tensor, Tensor]
 Jacobian = tuple[Tensor, Tensor, Tensor, Tensor]  # du/da, du/db, dv/da, dv/db
 
 _DIRECTIONS = 64  # in which stages without bounds of their own are sampled

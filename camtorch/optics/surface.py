@@ -12,7 +12,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from camtorch.optics.lens import Jacobian, Planes2, Stage, StageAt
+from camtorch.optics.charts import Planes2
+from camtorch.optics.lens import Jacobian, Stage, StageAt
 
 BEHIND = 1e-4  # cells past its edge that belong to a surface, so that points on its edge are on it in any rounding
 

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens
 
-Planes2 = tuple[Tensor, Tensor]
-
 _MOST_LOOKED_AT = 512  # numbers that are checked one by one
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.export import repeat, times
+from camtorch.optics.charts import Planes2
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import bracketed
 from camtorch.projection.domain import regular
@@ -18,7 +19,6 @@ from camtorch.projection.fold import azimuth
 if TYPE_CHECKING:
     from camtorch.projection.domain import Domain
 
-Planes2 = tuple[Tensor, Tensor]
 Found = tuple[Tensor, Tensor, Tensor]
 
 _CLOSE = 0.02

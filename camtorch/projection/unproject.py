@@ -9,13 +9,14 @@ from torch import Tensor
 
 from camtorch.evaluate.export import times
 from camtorch.evaluate.recorded import order_of, positive, to_planes, without_keeping
+from camtorch.optics.charts import Planes2
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
 from camtorch.projection import compiled
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.native_cameras import Native
 from camtorch.projection.ops import search_in_place, search_open
-from camtorch.projection.rows import CameraRows, Direction, Planes2, Traced, replace, to_mask
+from camtorch.projection.rows import CameraRows, Direction, Traced, replace, to_mask
 from camtorch.projection.solve import search
 from camtorch.values.arguments import columns
 
