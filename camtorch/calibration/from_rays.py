@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import torch
 from torch import Tensor
 
-from camtorch.calibration.calibrate import Model, as_model
+from camtorch.calibration.calibrate import as_model
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import fixed_camera
 from camtorch.convert import fitting, views
@@ -70,7 +70,15 @@ def fit(
     asked = as_model(model, count, None, fixed, owner)
     start = asked.start
     size = as_image_size(image_size, owner) or (None if start is None else start.image_size)
-    kept = _fixed_values(asked, size, owner)
+    # the values (4 + n,) that parameters keep, NaN for those to find
+    height, width = size or (1, 1)
+    values = [torch.nan, torch.nan, (width - 1) / 2, (height - 1) / 2, *asked.kind.ideal(asked.count)]
+    kept = torch.tensor(values, dtype=torch.float64, device="cpu")
+    if start is not None:
+        kept = torch.cat([t.detach().double().reshape(-1).cpu() for t in start._tensors])
+    elif size is None and not bool(asked.free[2:4].all()):
+        raise ValueError(f"{owner}: image_size must be given if cx or cy is fixed; got None. Pass (height, width)")
+    kept = torch.where(asked.free, torch.nan, kept)
     given_rays = as_values(rays, "rays", owner).detach().double()
     given_pixels = as_values(pixels, "pixels", owner, given_rays.device).detach().double()
     dims = given_pixels.ndim - 1
@@ -117,9 +125,8 @@ def fit(
         starts = torch.cat((own, starts))
     ideal = slopes.new_tensor(asked.kind.ideal(asked.count)).expand(len(slopes), -1)
     template = fixed_camera(asked.kind, slopes, ideal, size or (1, 1))
-    if kept is not None:
-        kept = kept.to(starts)
-        starts = torch.where(kept[4:].isnan(), starts, kept[4:])
+    kept = kept.to(starts)
+    starts = torch.where(kept[4:].isnan(), starts, kept[4:])
     parameters = fitting.fit(template, seen, starts, slopes, fixed=kept)
     camera = asked.camera(parameters.reshape(*batch, -1), size)
     found, valid = fixed_camera(asked.kind, parameters[:, :4], parameters[:, 4:]).project(seen.rays)
@@ -133,21 +140,6 @@ def fit(
         "exact": torch.zeros_like(counts[:, 0]),
     }
     return Conversion(camera, **{name: t.reshape(batch) for name, t in numbers.items()}, source_name="rays")
-
-
-def _fixed_values(asked: Model, size: tuple[int, int] | None, owner: str) -> Tensor | None:
-    """Return the values (4 + n,) that parameters keep, NaN for those to find; None if all are to be found."""
-    if bool(asked.free.all()):
-        return None
-    if asked.start is not None:
-        values = torch.cat([t.detach().double().reshape(-1).cpu() for t in asked.start._tensors])
-    else:
-        if size is None and not bool(asked.free[2:4].all()):
-            raise ValueError(f"{owner}: image_size must be given if cx or cy is fixed; got None. Pass (height, width)")
-        height, width = size or (1, 1)
-        ideal = asked.kind.ideal(asked.count)
-        values = torch.tensor([torch.nan, torch.nan, (width - 1) / 2, (height - 1) / 2, *ideal], dtype=torch.float64)
-    return torch.where(asked.free, torch.nan, values)
 
 
 def _fit_unified(seen: fitting.Observations, owner: str) -> Camera:

@@ -38,11 +38,6 @@ class _Lines(NamedTuple):
     measures: Tensor  # (B, 3, N, 3): the slopes of u and v by the ray, px, and the ray; zeros if unseen
     threshold: float
 
-    def forms(self) -> Tensor:
-        """Return matrices (B, 12, 3 N) that map [R t] to the measures of all points."""
-        points = pad(self.points, (0, 1), value=1.0)
-        return (self.measures[..., :, None] * points[:, None, :, None]).flatten(3).flatten(1, 2).mT
-
     def squares(self, poses: Tensor, forms: Tensor) -> Tensor:
         """Return squared distances (B, S, N) in px^2 at poses (B, S, 3, 4), at most the threshold's square."""
         u, v, depth = (poses.flatten(2) @ forms).unflatten(2, (3, -1)).unbind(2)
@@ -139,7 +134,9 @@ class _Search(NamedTuple):
             found = poses_from_rays(points, rays, torch.ones_like(rays[..., 0]))
             poses = torch.cat((found.rotations, found.translations[..., None]), -1)
             poses = torch.where(found.valid[..., None, None], poses, torch.nan)
-            forms, poses = lines.forms(), poses.view(len(part), -1, 3, 4)
+            # matrices (B, 12, 3 N) that map [R t] to the measures of all points
+            forms = lines.measures[..., :, None] * pad(lines.points, (0, 1), value=1.0)[:, None, :, None]
+            forms, poses = forms.flatten(3).flatten(1, 2).mT, poses.view(len(part), -1, 3, 4)
             chosen = lines.squares(poses, forms).sum(-1).topk(_TRIED, largest=False).indices
             poses = poses.take_along_dim(chosen[..., None, None], 1).nan_to_num(0.0, 0.0, 0.0)
             poses = torch.cat((poses, self.best[part, None]), 1)

@@ -107,20 +107,6 @@ def _sight(rays: Tensor, weights: Tensor) -> Tensor:
     return normalize((weights[..., None] * rays).sum(-2), dim=-1)
 
 
-def _moments(rays: Tensor, points: Tensor, weights: Tensor) -> Tensor:
-    """Return the sums (B, 3, 3, 3, 3) of (I - r r^T) x p p^T over points p with unit rays r."""
-
-    def products(vectors: Tensor) -> Tensor:
-        x, y, z = vectors.unbind(-1)
-        return torch.stack((x * x, x * y, x * z, y * y, y * z, z * z), -1)
-
-    pairs = products(points) * weights[..., None]
-    along = products(rays).mT @ pairs
-    across = pairs.sum(-2)[:, None] * pairs.new_tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])[:, None] - along
-    index = torch.tensor(_PAIRS, device=rays.device)
-    return across[:, index[:, :, None, None], index]
-
-
 def _homography(sight: Tensor, distances: _Distances) -> Tensor:
     """Return homographies (B, 3, 3) from the plane's points (x, y, 1) to rays of mean direction `sight` (B, 3)."""
     # the first two columns' entries across the line of sight, and along it, where narrow views hardly determine them
@@ -147,7 +133,17 @@ class _Distances(NamedTuple):
 
     @classmethod
     def between(cls, local: Tensor, rays: Tensor, weights: Tensor) -> _Distances:
-        form = _moments(rays, local, weights).transpose(2, 3).reshape(-1, 9, 9)
+
+        def products(vectors: Tensor) -> Tensor:
+            x, y, z = vectors.unbind(-1)
+            return torch.stack((x * x, x * y, x * z, y * y, y * z, z * z), -1)
+
+        # the sums (B, 3, 3, 3, 3) of (I - r r^T) x p p^T over points p with unit rays r
+        pairs = products(local) * weights[..., None]
+        along = products(rays).mT @ pairs
+        across = pairs.sum(-2)[:, None] * pairs.new_tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])[:, None] - along
+        index = torch.tensor(_PAIRS, device=rays.device)
+        form = across[:, index[:, :, None, None], index].transpose(2, 3).reshape(-1, 9, 9)
         eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
         weighted = weights[..., None] * rays
         # rays that are all the same leave the distance open
