@@ -32,11 +32,6 @@ class Lattice(NamedTuple):
         """Return the nodes (C, side^2, 2)."""
         return lattices.pixel_lattice(self.low, self.high, self.side, self.side).flatten(1, 2)
 
-    def between(self, places: Tensor) -> Tensor:
-        """Clamp places (C, N, 2) to the lattice; azimuths are not clamped."""
-        inside = places.clamp(self.low[:, None], self.high[:, None])
-        return inside if self.are_pixels else torch.stack((inside[..., 0], places[..., 1]), -1)
-
     def sampled(self, camera: CameraLike, places: Tensor) -> Observations:
         """Return the rays of a camera at places (C, N, 2)."""
         if self.are_pixels:
@@ -53,7 +48,14 @@ def lattice(camera: CameraLike, image_size: tuple[int, int] | None, side: int, l
     """Return a lattice over the image up to the angle `limit`, edges included; over all directions without an image."""
     count = len(camera.intrinsics)
     if image_size is None:
-        most = _reach(camera, limit)
+        # the angle (C, 1) up to which the camera has rays on some azimuth
+        azimuths = (torch.arange(_AZIMUTHS).to(camera.intrinsics) + 0.25) * (2 * math.pi / _AZIMUTHS)
+
+        def covers(rays: Tensor) -> Tensor:
+            return camera.project(rays.expand(count, *rays.shape[-3:]))[1]
+
+        ends = lattices.reach(covers, azimuths, steps=_ANGLES, rounds=1).amax(-1, keepdim=True)
+        most = torch.where(ends < math.pi / 2, ends.clamp(max=_END_AHEAD), ends).clamp(max=limit)
         # no node lies on the cut of panoramas, and the last azimuth is next to the first one
         first, last = (torch.full_like(most, (i + 0.25) * 2 * math.pi / side) for i in (0, side - 1))
         low, high = torch.cat((torch.zeros_like(most), first), -1), torch.cat((most, last), -1)
@@ -92,17 +94,6 @@ def seen(camera: CameraLike, image_size: tuple[int, int] | None, fan: Tensor) ->
         low, high = lattices.image_edges(image_size, pixels)
         valid = valid & (pixels >= low).all(-1) & (pixels <= high).all(-1)
     return Observations(rays, pixels, valid.to(pixels.dtype))
-
-
-def _reach(camera: CameraLike, limit: float) -> Tensor:
-    """Return the angle (C, 1) up to which a camera has rays on some azimuth."""
-    azimuths = (torch.arange(_AZIMUTHS).to(camera.intrinsics) + 0.25) * (2 * math.pi / _AZIMUTHS)
-
-    def covers(rays: Tensor) -> Tensor:
-        return camera.project(rays.expand(len(camera.intrinsics), *rays.shape[-3:]))[1]
-
-    ends = lattices.reach(covers, azimuths, steps=_ANGLES, rounds=1).amax(-1, keepdim=True)
-    return torch.where(ends < math.pi / 2, ends.clamp(max=_END_AHEAD), ends).clamp(max=limit)
 
 
 def focal_at_axis(camera: CameraLike) -> Tensor:

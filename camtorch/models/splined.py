@@ -15,7 +15,6 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.freezing import INTRINSICS, frozen_names
 from camtorch.evaluate.known import values_of
 from camtorch.optics import Chart, Lens, Surface, Unified
-from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.optics.surface import BEHIND
 from camtorch.values.arguments import as_whole, hinting
 
@@ -37,8 +36,7 @@ class StereographicUpTo(Unified):
     def usual_end(self, dtype: torch.dtype) -> float:
         return self.last
 
-    def radii(self, count: int, like: Tensor) -> Tensor:
-        return even_steps_and_ratios(count, self.last, self.last, like, torch.positive)
+    radii = Chart.radii
 
 
 class Splined(Camera):

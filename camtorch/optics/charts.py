@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -89,9 +89,11 @@ class Chart:
     def radii(self, count: int, like: Tensor) -> Tensor:
         """Return ascending radii (count,) from the centre of the plane to the end of the chart.
 
-        Half of them are in even steps of the angle, half in even ratios: a telephoto lens may fold within a degree.
+        Half of them are in even steps of the angle, half in even ratios: a telephoto lens may fold within a degree. By
+        default the steps are of the radius, up to an `end` that is a float.
         """
-        raise NotImplementedError
+        end: Any = self.end(like.dtype)
+        return even_steps_and_ratios(count, end, end, like, torch.positive)
 
 
 def even_steps_and_ratios(
@@ -276,9 +278,6 @@ class Equisolid(Chart):
     def end(self, dtype: torch.dtype) -> float:
         # at the end itself the derivative of its ray is infinite
         return 2 * (1 - 64 * torch.finfo(dtype).eps)
-
-    def radii(self, count: int, like: Tensor) -> Tensor:
-        return even_steps_and_ratios(count, self.end(like.dtype), self.end(like.dtype), like, torch.positive)
 
 
 class Fov(Chart):
