@@ -18,8 +18,8 @@ from camtorch.rays.lattices import angles_from_axis
 from camtorch.values.arguments import Numbers, as_image_size, as_values, hinting
 from camtorch.values.threads import on_one_thread
 
+# of unified lenses to try first: 0 is perspective, 1/2 stereographic, 0.65 nearly equidistant
 _ALPHAS = (0.0, 0.35, 0.5, 0.6, 0.65, 0.75)
-"""The alphas of unified lenses to try first: 0 is perspective, 1/2 stereographic, 0.65 nearly equidistant."""
 _NEAREST = 0.05  # the least divisor of a unified lens, for unit rays, of points that count in the first fit
 _LEAST = 4  # rays
 

@@ -158,7 +158,7 @@ def _convert(task: _Task, count: int) -> _Result:
     rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
     if len(rows):
         these = task.of(rows)
-        observations = views.sample_with_rings(these.source.camera, task.image_size, _FIT_SIDE, task.limit)
+        observations = views.with_rings(samples.of(rows), these.source.camera, task.image_size)
         minimax = _measure(these, refine_minimax(build(parameters), observations, parameters[rows]), exact[rows])
         better = minimax.max_error < result.max_error[rows]
         better &= _reaches_as_far(minimax.max_angle, result.max_angle[rows])

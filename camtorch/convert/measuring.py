@@ -85,8 +85,8 @@ def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> 
         step = ((lattice.high - lattice.low) / (side - 1))[:, None, None]
         for _ in range(_ROUNDS):
             near = (places[:, :, None] + step * offsets).flatten(1, 2)
-            inside = near.clamp(lattice.low[:, None], lattice.high[:, None])  # except for azimuths
-            near = inside if lattice.are_pixels else torch.stack((inside[..., 0], near[..., 1]), -1)
+            clamped = near.clamp(lattice.low[:, None], lattice.high[:, None])  # except for azimuths
+            near = clamped if lattice.are_pixels else torch.stack((clamped[..., 0], near[..., 1]), -1)
             found, best = error_within(lattice.sampled(source.camera, near)).unflatten(1, (_PEAKS, -1)).max(-1)
             places = near.unflatten(1, (_PEAKS, -1)).gather(2, best[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
             step = step / 3

@@ -76,9 +76,8 @@ def sample(camera: CameraLike, image_size: tuple[int, int] | None, side: int, li
     return nodes.sampled(camera, nodes.nodes())
 
 
-def sample_with_rings(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> Observations:
-    """Return `sample` with further rays on circles around the axis: errors of a radial lens change along radii."""
-    whole = sample(camera, image_size, side, limit)
+def with_rings(whole: Observations, camera: CameraLike, image_size: tuple[int, int] | None) -> Observations:
+    """Return the rays and more of them on circles around the axis: errors of a radial lens change along radii."""
     reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
     # steps of float32 might exceed half a circle
     steps = torch.linspace(0, 1, _RADII, dtype=reach.dtype, device=reach.device)

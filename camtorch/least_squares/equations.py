@@ -23,11 +23,6 @@ class Equations(NamedTuple):
     shared: Tensor  # (B, G + 1, G + 1): the rest of all views
     columns: tuple[tuple[int, int], ...] = ()  # (G,)
 
-    @property
-    def decrement(self) -> Tensor:
-        """The decrease (B,) of the cost by a full step if the problem were linear."""
-        return self.view[..., -1].square().sum((-1, -2)) + self.shared[:, :-1, -1].square().sum(-1)
-
 
 _NOTHING = 1e-20  # of a column's squares: the rounding left of a column that is a sum of others
 _FEW = 64  # shared unknowns, up to which compiled code is faster than LAPACK
@@ -43,6 +38,7 @@ class System:
         of_views, own = equations.view.square().sum((1, 2)), equations.shared[:, :-1].square().sum(-2)
         # unknowns that the views' own unknowns can replace, like a turn about a panorama's axis, are held
         held = held | (own < _NOTHING * (own + of_views[:, width:]))[:, :-1]
+        # the decrease of the cost by a full step if the problem were linear
         self.equations, self.decrement = equations, of_views[:, -1] + own[:, -1]
         if bool(held.any()):
             keep = torch.nn.functional.pad(~held, (width, 1), value=True)
@@ -53,7 +49,8 @@ class System:
             )
             # without a column the rest is not a triangle
             self.equations = equations._replace(shared=torch.linalg.qr(equations.shared, mode="r").R)
-            self.decrement = self.equations.decrement
+            view, shared = self.equations.view[..., -1], self.equations.shared[:, :-1, -1]
+            self.decrement = view.square().sum((-1, -2)) + shared.square().sum(-1)
 
     @property
     def firm_decrement(self) -> Tensor:

@@ -14,8 +14,7 @@ from camtorch.optics.charts import Chart, Equidistant, Planes3, even_steps_and_r
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.radial_inverse import RadialInverse
 
-FURTHEST = math.tan(math.radians(87))
-"""The radius, in focal lengths, up to which pixels have rays."""
+FURTHEST = math.tan(math.radians(87))  # the radius, in focal lengths, up to which pixels have rays
 
 
 class Inverted(Chart):

@@ -19,16 +19,13 @@ from camtorch.values.arguments import columns
 if TYPE_CHECKING:
     from camtorch.optics.radial import RadialFactor
 
-RADII = 1024
-"""The number of radii at which a factor is followed to its fold."""
+RADII = 1024  # at which a factor is followed to its fold
 _PARTS = 256  # of the interval with a fold, divided twice before the secant
 _NODES = 1024  # of the table of an inverse
-TABLE_WIDTH = 2 + 2 * _NODES
-"""The number of columns of `tabulate`."""
+TABLE_WIDTH = 2 + 2 * _NODES  # columns of `tabulate`
 _LIMITING = 16  # roots of a radius, to one whose image is a number
 _HALF_WAY = 2.0  # the squared radius in the middle of the table of a lens that never folds
-MOST_STEPS = 5
-"""The most steps of Newton's method; slower methods finish what still moves."""
+MOST_STEPS = 5  # of Newton's method; slower methods finish what still moves
 
 
 def precise(k: Tensor) -> Tensor:

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
     CameraT = TypeVar("CameraT", bound=CameraLike)
 
-AXES = ("horizontal", "vertical", "diagonal")
-"""The lines of an image along which a field of view is measured."""
+AXES = ("horizontal", "vertical", "diagonal")  # of an image, along which a field of view is measured
 
 _LINE = 513  # points along a line of the image
 
