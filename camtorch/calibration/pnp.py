@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from camtorch.calibration.batches import as_tensor, as_vectors, attached, learns, root_of, rows_of
 from camtorch.calibration.bundle import CameraObservations, Poses, adjust_poses
 from camtorch.calibration.compiled import Search, Solved, solve_poses
-from camtorch.calibration.ransac import consensus
+from camtorch.calibration.ransac import LEAST, consensus
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.cameras.camera import Camera
 from camtorch.poses.extrinsics import Extrinsics
@@ -23,7 +23,6 @@ from camtorch.values.arguments import Numbers, as_number, broadcast_shapes, hint
 from camtorch.values.module import model_of, remade
 from camtorch.values.threads import on_one_thread
 
-_LEAST = 4  # points
 _FEW = 5  # points, which may have minima far from their start
 _WORSE = 4.0  # times the least cost: a start below that may lead to less
 _MOVE = 1e-6  # of rays, the step of finite differences
@@ -169,10 +168,10 @@ class _Given(NamedTuple):
         count = seen_at.shape[-2]
         given = None if weights is None else as_tensor(weights, "weights", owner, device)
         shapes = f"object_points {tuple(points.shape)} and pixels {tuple(seen_at.shape)}"
-        if points.shape[-2] != count or count < _LEAST:
+        if points.shape[-2] != count or count < LEAST:
             hint = "Pad rows of fewer points with NaN pixels"
             raise ValueError(
-                f"{owner}: object_points and pixels must be as many points, {_LEAST} or more; got {shapes}. {hint}"
+                f"{owner}: object_points and pixels must be as many points, {LEAST} or more; got {shapes}. {hint}"
             )
         if given is not None and (given.shape[-1:] != (count,) or not bool((given >= 0).all())):
             got = f"shape {tuple(given.shape)}, down to {given.detach().min().item():.4g}"
@@ -314,7 +313,7 @@ def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor
     parameters = parameters.view(-1, parameters.shape[-1])
     observed = CameraObservations(model_of(camera), task.points[:, None], task.pixels[:, None], task.weights[:, None])
     found = adjust_poses(observed, parameters, Poses(rotations[:, None], translations[:, None]), steps=_SEARCH.steps)
-    fine = found.converged & valid & ((task.weights > 0).sum(-1) >= _LEAST)
+    fine = found.converged & valid & ((task.weights > 0).sum(-1) >= LEAST)
     fine = fine & (found.valid[0][:, 0] | (task.weights == 0)).all(-1)
     (turned,), (moved,) = (t.unbind(1) for t in found.state.boards)
     return _Found(torch.where(fine, found.cost, torch.inf), turned, moved, found.equations.view[:, 0])
@@ -341,4 +340,4 @@ def _are_spread(points: Tensor, inliers: Tensor) -> Tensor:
     moments = (weights[..., None] * centred).mT @ centred
     # with eigenvalues a > b > c, these are (a + b + c)^2 and 2 (a b + b c + c a)
     whole = moments.diagonal(dim1=-2, dim2=-1).sum(-1).square()
-    return (counts >= _LEAST) & (whole - moments.square().sum((-1, -2)) > 2 * _LINE**2 * whole)
+    return (counts >= LEAST) & (whole - moments.square().sum((-1, -2)) > 2 * _LINE**2 * whole)

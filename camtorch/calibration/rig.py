@@ -176,7 +176,6 @@ def calibrate_rig(
 
 
 def _own(given: Any, name: str, otherwise: Any) -> Any:
-    """Return the argument of one camera, given by name or for all."""
     return given.get(name, otherwise) if isinstance(given, Mapping) else given
 
 

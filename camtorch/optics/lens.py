@@ -155,7 +155,6 @@ class Planar(Stage):
         self.parameters: tuple[Tensor, ...] = (*of_radial, *self.tangential, *self.prism)
 
     def at(self, a: Tensor, b: Tensor, order: int = 1, t: Tensor | None = None) -> PlanarAt:
-        """Return the stage at points; see `PlanarAt`."""
         return PlanarAt(self, a, b, order, t)
 
     def lower_bound(self, radius: Tensor) -> Planes2:

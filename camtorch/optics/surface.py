@@ -158,7 +158,6 @@ class Surface(Stage):
         return torch.where(inside > 0, 1 - steepest - across, inside.clamp(max=-1e-3)), far
 
     def start(self, u: Tensor, v: Tensor) -> Planes2:
-        """Return a point near the one whose image is (u, v)."""
         (sa, sb), (ca, cb) = self.cells, self.centre
         half_a, half_b = (self.columns - self.order) / 2 / sa, (self.rows - self.order) / 2 / sb
         a, b = u, v

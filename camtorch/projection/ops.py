@@ -12,20 +12,16 @@ from torch import Tensor
 
 from camtorch.evaluate.recorded import CLASSES
 from camtorch.optics.radial_inverse import TABLE_WIDTH
-from camtorch.projection.domain import Domain, domain_of
+from camtorch.projection.domain import domain_of
 from camtorch.projection.fold import AZIMUTHS
 from camtorch.projection.solve import search
 from camtorch.values.arguments import columns
 
 
-def _domain(model: str, k: Tensor) -> Domain:
-    return domain_of(model, k, CLASSES[model].optics)
-
-
 @torch.library.custom_op("camtorch::tables", mutates_args=())
 def tables(model: str, k: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return `safe_radius_sq`, `limits2` and `table` of a `Domain`, without columns if the lens needs none."""
-    domain = _domain(model, k)
+    domain = domain_of(model, k, CLASSES[model].optics)
     empty = k.new_empty(len(k), 0)
     # clones, as the caller may write into them
     return (
@@ -51,7 +47,8 @@ def search_in_place(
         return
     camera, point = (~(solved > 0) & (possible > 0)).nonzero(as_tuple=True)
     if len(camera):
-        found_a, found_b, found = search(_domain(model, k), camera, u[camera, point], v[camera, point])
+        domain = domain_of(model, k, CLASSES[model].optics)
+        found_a, found_b, found = search(domain, camera, u[camera, point], v[camera, point])
         a[camera, point], b[camera, point] = found_a, found_b
         solved[camera, point] = torch.where(found, 1.0, -1.0).to(solved.dtype)
 
