@@ -13,13 +13,13 @@ CAMERAS = [
 ]
 
 
-def rig(seed=0):
+def rig(seed=0, far=1.0):
     """Three cameras of different models, their poses, points, and the pixels of those that each sees."""
     g = torch.Generator().manual_seed(seed)
     cameras = [camera.requires_grad_(False) for camera in CAMERAS]
     poses = [(0.2 * torch.randn(3, generator=g).double(), torch.randn(3, generator=g).double()) for _ in cameras]
     extrinsics = [ct.Extrinsics(*pose).requires_grad_(False) for pose in poses]
-    points = torch.randn(400, 3, generator=g).double() * 3 + torch.tensor([0.0, 0.0, 3.0])
+    points = torch.randn(400, 3, generator=g).double() * 3 * far + torch.tensor([0.0, 0.0, 3.0])
     pixels = []
     for camera, pose in zip(cameras, extrinsics, strict=True):
         found, valid = camera.project(pose(points))
@@ -52,8 +52,9 @@ def test_exact_pixels_give_the_points_and_invalid_ones_have_no_gradient():
     assert pixels.grad[:, valid].any()
 
 
-def test_the_reprojection_error_is_least():
-    cameras, extrinsics, points, pixels = rig()
+@pytest.mark.parametrize("far", [1.0, 100.0])
+def test_the_reprojection_error_is_least_wherever_the_origin_is(far):
+    cameras, extrinsics, points, pixels = rig(far=far)
     pixels = pixels + torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1)).double()
     found, rms, valid = ct.triangulate(cameras, extrinsics, pixels)
     here = rms_of(cameras, extrinsics, found, pixels)
@@ -61,6 +62,12 @@ def test_the_reprojection_error_is_least():
     assert (rms <= rms_of(cameras, extrinsics, points, pixels))[valid].all()
     for step in 1e-3 * torch.cat((torch.eye(3), -torch.eye(3))).double():
         assert (rms_of(cameras, extrinsics, found + step, pixels) >= rms)[valid].all()
+    origin = torch.tensor([1e5, -2e5, 1e5]).double()  # as on a map, where rounding moves pixels by some 1e-8
+    moved = [ct.Extrinsics(pose.rotation, pose.translation - pose.matrix()[:3, :3] @ origin) for pose in extrinsics]
+    there = ct.triangulate(cameras, moved, pixels)
+    assert torch.equal(there.valid, valid)
+    torch.testing.assert_close(there.rms[valid], rms[valid], rtol=0, atol=1e-8)
+    torch.testing.assert_close((there.points - origin)[valid], found[valid], rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("apart", [0.0, pytest.param(1e-3, marks=pytest.mark.slow)])

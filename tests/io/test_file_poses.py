@@ -172,6 +172,9 @@ def test_poses_of_colmap_stay_together(tmp_path):
 def test_angles_of_nerfstudio(keys, focal):
     camera = ct.loads({"w": 640, "h": 480, "frames": [], **keys}).camera
     assert camera.intrinsics.tolist() == pytest.approx([*focal, 319.5, 239.5], rel=1e-12)
+    for side in ({"w": 640}, {"h": 480}):  # one alone is no size
+        camera = ct.loads({**side, "fl_x": 500, "cx": 320, "cy": 240, "frames": []}).camera
+        assert (camera.image_size, camera.intrinsics.tolist()) == (None, [500, 500, 319.5, 239.5])
 
 
 HOLDING = {"camtorch", "kalibr", "colmap", "nerfstudio", "aria", "basalt"}

@@ -131,9 +131,12 @@ def test_a_scene_that_overtakes_the_rows_is_invalid_and_finite():
     warp = ct.ShutterWarp(camera, camera, target_shutter=shutter(rates=(60.0, 0.0, 0.0), readout=0.1))
     rates = torch.tensor([60.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
     learned = ct.ShutterWarp(camera, camera, target_shutter=ct.RollingShutter(0.1, rates))
+    pixels = camera.pixel_grid()
     for each in (warp, learned):
-        moved, valid = each.transform_points(camera.pixel_grid())
+        moved, valid = each.transform_points(pixels)
         assert not valid.all()
+        back, seen = each.inverse().transform_points(moved)
+        assert (back - pixels)[valid & seen].abs().max() < 1e-3  # of a pixel, as far as the time is searched for
         assert torch.isfinite(moved).all()
         assert torch.isfinite(each.grid()).all()
     moved.sum().backward()
