@@ -52,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")  # for names of files that its encoding lacks
+    if sys.stderr is None:  # closed by the shell; a bar asks whether it is a terminal
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
     try:
         arguments = make_parser().parse_args(argv)
         module = f"camtorch.cli.{arguments.command}"
