@@ -87,6 +87,7 @@ def _begin(pickled: bytes) -> None:
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles interrupts
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # removes the partial file
     threading.Thread(target=end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     _work = pickle.loads(pickled)
@@ -97,14 +98,9 @@ def _attempt(pair: Pair, work: Work | None = None) -> Outcome:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:
-            if work is None:
-                signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # removes the partial file
             found = (work or _work)(*pair)
         except SystemExit:  # after which the executor would continue
             os._exit(1)
         except Exception as error:
             return Outcome(failure=reason(error))
-        finally:
-            if work is None:
-                signal.signal(signal.SIGTERM, signal.SIG_DFL)
     return Outcome(found, notes=list(dict.fromkeys(str(warning.message) for warning in caught)))

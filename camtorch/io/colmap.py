@@ -104,13 +104,13 @@ def read(path: str, content: bytes) -> Rig:
     beside = _images_beside(path)
     if beside is None or not os.path.exists(beside):
         return Rig(cameras)
-    images, values, _, record = _read_images(beside)
+    images, rows, _, place = _read_images(beside)
     for row, camera in enumerate(images.values()):
         if camera not in cameras:
-            record(row).fail(f"its camera must be in {os.path.basename(path)}; got {camera}")
+            place(row).fail(f"its camera must be in {os.path.basename(path)}; got {camera}")
     if not images:
         return Rig(cameras)
-    return Rig(cameras, (list(images), poses.from_quaternions(record, values)), images=images)
+    return Rig(cameras, (list(images), poses.from_quaternions(place, rows)), images=images)
 
 
 def _images_beside(path: str) -> str | None:

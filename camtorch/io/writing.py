@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import math
 import os
 import re
 import secrets
@@ -31,20 +32,7 @@ def replacing(*paths: str | os.PathLike[str], synced: bool = True) -> Iterator[l
     """
     targets = [os.path.realpath(path) for path in paths]
     with contextlib.ExitStack() as stack:
-        files = list[IO[bytes]]()
-        for target in targets:
-            folder, mode = os.path.dirname(target), os.stat(target).st_mode if os.path.exists(target) else None
-            if not os.path.isdir(folder):
-                raise FileNotFoundError(errno.ENOENT, "no such folder", folder)
-            if mode is not None and not stat.S_ISREG(mode):
-                raise OSError(errno.EINVAL, "no ordinary file, so it cannot be replaced", target)
-            name = os.path.join(folder, f".{secrets.token_hex(12)}.part")  # the longest name has no room for a suffix
-            rights = 0o666 if mode is None else stat.S_IMODE(mode)  # the kernel takes the umask from both
-            stack.callback(Path(name).unlink, missing_ok=True)
-            file = open(name, "x+b", opener=lambda name, flags, rights=rights: os.open(name, flags, rights))  # noqa: SIM115
-            files.append(stack.enter_context(file))
-            if mode is not None:
-                os.chmod(name, rights)
+        files = [_opened_beside(target, stack) for target in targets]
         yield files
         for file in files:
             file.flush()
@@ -53,6 +41,22 @@ def replacing(*paths: str | os.PathLike[str], synced: bool = True) -> Iterator[l
             file.close()
         for file, target in zip(files, targets, strict=True):
             os.replace(file.name, target)
+
+
+def _opened_beside(path: str, stack: contextlib.ExitStack) -> IO[bytes]:
+    """Open an empty file in the folder of `path` with the same rights; `stack` closes and removes it."""
+    folder, mode = os.path.dirname(path), os.stat(path).st_mode if os.path.exists(path) else None
+    if not os.path.isdir(folder):
+        raise FileNotFoundError(errno.ENOENT, "no such folder", folder)
+    if mode is not None and not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "no ordinary file, so it cannot be replaced", path)
+    name = os.path.join(folder, f".{secrets.token_hex(12)}.part")  # the longest name has no room for a suffix
+    rights = 0o666 if mode is None else stat.S_IMODE(mode)  # the kernel takes the umask from both
+    stack.callback(Path(name).unlink, missing_ok=True)
+    file = open(name, "x+b", opener=lambda name, flags: os.open(name, flags, rights))  # noqa: SIM115
+    if mode is not None:
+        os.chmod(name, rights)
+    return stack.enter_context(file)
 
 
 def number(value: float) -> str:
@@ -102,13 +106,15 @@ class Lossy:
         """Return the numbers of a camera or a pose that is no batch."""
         if owner.batch_shape:
             self.fail(name, f"must be single for {self.format}; got a batch of {what} {tuple(owner.batch_shape)}")
-        return [self.numbers(name, getattr(owner, key), what) for key in owner.tensor_names]
+        kind = "numbers" if what == "cameras" else what
+        return [self.numbers(name, getattr(owner, key), kind) for key in owner.tensor_names]
 
     def numbers(self, name: str, tensor: Tensor, what: str = "numbers") -> Any:
         """Return the numbers of a tensor, which must be finite."""
-        if not bool(tensor.isfinite().all()):
+        values = tensor.detach().double().tolist()
+        if not all(map(math.isfinite, values if tensor.ndim == 1 else tensor.flatten().tolist())):
             self.fail(name, f"{what} must be finite; got NaN or infinity")
-        return tensor.detach().double().tolist()
+        return values
 
     def at_most(self, name: str, camera: Camera, distortion: list[float], counts: Sequence[int]) -> list[float]:
         """Return the coefficients, padded with zeros or without trailing zeros, so that their number is in `counts`."""
