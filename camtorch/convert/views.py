@@ -105,7 +105,7 @@ def focal_at_axis(camera: CameraLike) -> Tensor:
 
 def radii(camera: CameraLike, slopes: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
     """Return angles and radii for `Camera.fit_start`; reach: (C,) the last angle, 0 if nothing is seen."""
-    steps = torch.arange(1, _RADII + 1).to(camera.intrinsics) / _RADII
+    steps = torch.arange(1, _RADII + 1, device=slopes.device).to(slopes) / _RADII
     angles = torch.where(reach > 0, reach, 1.0)[:, None] * steps
     pixels, valid = camera.project(lattices.ray_fan(angles, _AZIMUTHS))
     plane = (pixels - slopes[:, None, None, 2:]) / slopes[:, None, None, :2]
