@@ -37,13 +37,6 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: item.path.name not in ("test_devices.py", "test_same_everywhere.py"))
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config):
-    """If all quick tests run, one process runs those of a file: it computes and imports once what they share."""
-    if config.args_source is config.ArgsSource.TESTPATHS and config.option.markexpr == "not slow":
-        config.option.dist, config.option.loadscopereorder = "loadfile", False  # files in their order
-
-
 @pytest.fixture(autouse=True)
 def _compiled_code_is_forgotten():
     """Programs of one function are counted, and refused from the ninth on, also where tests of their own made them."""

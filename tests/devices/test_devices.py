@@ -5,7 +5,6 @@ import operator
 
 import pytest
 import torch
-from cameras import DISTINCT, KEYS, slow_unless
 from pretended import try_cases
 from table import BROWN, CASES, DEPTH, FISHEYE, IMAGES, PIXELS, POINTS, POSE, SHUTTER
 
@@ -28,14 +27,9 @@ def test_every_public_name_is_in_the_table():
     assert found - {name.partition(" ")[0] for name in CASES} == OTHERS
 
 
-LONG = {"Camera moved in place", "PlaneWarp", "fit", "losses.rays", "rectify", "triangulate", "views.cube"}
-LONG |= {f"augment.{name}" for name in ("BoxCrop", "FaceNormalizer", "RandomCamera", "RandomMount shift")}
-LONG |= {f"{ct.MODELS[key].__name__} {key}" for key in KEYS if key not in DISTINCT}
-
-
-@pytest.mark.parametrize("long", slow_unless(False.__eq__, [False, True]))
-def test_results_are_those_of_the_cpu_and_costs_do_not_grow(long):
-    failed, table = try_cases("table", *(name for name in CASES if (name in LONG) == long))
+@pytest.mark.slow  # ten seconds
+def test_results_are_those_of_the_cpu_and_costs_do_not_grow():
+    failed, table = try_cases("table")
     print(table)
     assert not failed, table
 
