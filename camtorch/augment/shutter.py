@@ -38,12 +38,7 @@ class RandomShutter(Augmentation):
     keeps_lens: ClassVar[bool] = True
 
     def __init__(
-        self,
-        readout: RangeLike,
-        rates: RangeLike,
-        *,
-        direction: Direction = "down",
-        **options: Unpack[EditOptions],
+        self, readout: RangeLike, rates: RangeLike, *, direction: Direction = "down", **options: Unpack[EditOptions]
     ):
         name = type(self).__name__
         readout = (readout, readout) if isinstance(readout, (int, float)) else readout

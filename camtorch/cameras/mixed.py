@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import accumulate
+from itertools import accumulate, product
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 
 import torch
@@ -251,8 +251,17 @@ class Mixed(Camera):
         given = as_numbers_of(self, intrinsics, "intrinsics")
         if given.shape not in ((4,), (1, 4), (len(self), 4)):
             raise ValueError(f"Mixed: intrinsics must be ({len(self)}, 4) or (4,); got shape {tuple(given.shape)}")
-        pairs = zip(self, given.expand(len(self), 4), strict=True)
-        return type(self)([camera.replace(row, None, image_size) for camera, row in pairs])
+        given = given.expand(len(self), 4)
+        learns = [self._member(i).intrinsics.requires_grad for i, _ in self._places]
+        new = []
+        for (rows, group), state in product(self.groups, (False, True)):
+            if here := [n for n, row in enumerate(rows) if learns[row] == state]:
+                part = group if len(here) == len(rows) else group[here]
+                made = part.replace(given[[rows[n] for n in here]], None, image_size)
+                if isinstance(made.intrinsics, nn.Parameter):  # made of plain numbers
+                    made.intrinsics.requires_grad_(state)
+                new.append(([rows[n] for n in here], made))
+        return type(self).of_groups(new)
 
     def __getitem__(self, index: Any) -> Camera:  # type: ignore[override]
         """Return one camera for an int, itself if it was given alone; otherwise the `Mixed` of a part of the batch.

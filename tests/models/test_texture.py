@@ -274,6 +274,8 @@ def test_a_mixed_batch_keeps_precision_and_what_is_fixed():
     made = ct.Mixed([learning.detach(), learning, pinhole]).replace(numbers)
     assert made.intrinsics.tolist() == numbers
     assert [camera.intrinsics.requires_grad for camera in made] == [False, True, True]
+    alike = ct.Mixed([pinhole.detach(), learning.detach()] * 2).replace(numbers[0])
+    assert len(list(alike.parameters())) == 3  # stacked by model, not of each camera
 
 
 def test_what_is_made_without_a_graph_is_fixed():
