@@ -96,6 +96,11 @@ def test_every_image_is_filled_as_asked(name, share):
     torch.testing.assert_close(after[enough], before[enough], atol=1e-3, rtol=0)
 
 
+def test_a_camera_that_is_not_turned_is_zoomed_as_far_as_it_takes(untold):
+    with pytest.warns(UserWarning, match="fov must be 150 degrees"):  # five times as wide as it was
+        assert shares(RandomLens("pinhole", fov=150, camera=pinhole(), min_filled=0.9), 2).min() >= 0.9
+
+
 def test_no_more_is_zoomed_than_needed():
     """What is filled above the part that was asked for is what a coarse lattice cannot tell."""
     for name in ("camera", "mount", "lens"):
