@@ -127,6 +127,8 @@ class Augmentation(SampleTransform):
     min_filled: float | None
     _last: Change | Callable[[], Change] | None = None
     _is_first: bool = False  # whether the last sample came without a rotation
+    _warned: bool = False
+    _spans: Spans | None = None
 
     def __init__(
         self,
@@ -140,11 +142,8 @@ class Augmentation(SampleTransform):
         super().__init__(**options)
         self.p = as_part(p, "p", self._name, "probability")
         self.same_on_batch = as_flag(same_on_batch, "same_on_batch", self._name)
-        self.ranges = dict(ranges or {})
-        self.crops = {}
+        vars(self).update(ranges=dict(ranges or {}), crops={})  # which are properties of a `Compose`
         self.min_filled = None if min_filled is None else as_part(min_filled, "min_filled", self._name)
-        self._warned = False
-        self._spans: Spans | None = None
 
     @property
     def last(self) -> Change | None:
@@ -485,9 +484,6 @@ class Augmentation(SampleTransform):
 
         @typed_as(forward)
         def __call__(self, *args: Any, **options: Any) -> Any: ...
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_last": None}
 
     def extra_repr(self) -> str:
         parts = [f"{name}={interval}" for name, interval in self.ranges.items()]

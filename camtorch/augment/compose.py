@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
@@ -66,13 +67,8 @@ class Compose(Augmentation):
         options.setdefault("antialias", None)
         if any(part.valid_mask for part in parts):
             options.setdefault("valid_mask", True)
-        ranges: dict[str, Range] = {}
-        for i, part in enumerate(parts):
-            ranges |= {f"{i}.{key}": interval for key, interval in [("apply", Range(0, 1)), *part.ranges.items()]}
-        super().__init__(ranges, **options)
+        super().__init__(**options)
         self.augmentations = nn.ModuleList(parts)
-        crops = {f"{i}.{key}": index for i, part in enumerate(parts) for key, index in part.crops.items()}
-        self.crops: Mapping[str, int] = crops
         self.needs_camera: bool = any(part.needs_camera for part in parts)
         self.drawn_on_host: bool = all(part.drawn_on_host for part in parts)
         self._check_options(parts)
@@ -105,6 +101,18 @@ class Compose(Augmentation):
             ):
                 if wrong:
                     raise ValueError(f"{self._name}: parts must {reason}; got {kind} at place {i}")
+
+    @property
+    def ranges(self) -> Mapping[str, Range]:  # type: ignore[override]
+        """The ranges of all parts, by the part's index and the name in it, as "0.yaw"; change those of a part."""
+        own = [{"apply": Range(0, 1), **part.ranges} for part in self.parts]
+        return MappingProxyType({f"{i}.{key}": value for i, ranges in enumerate(own) for key, value in ranges.items()})
+
+    @property
+    def crops(self) -> Mapping[str, int]:  # type: ignore[override]
+        """See `Augmentation`; those of all parts."""
+        found = {f"{i}.{key}": index for i, part in enumerate(self.parts) for key, index in part.crops.items()}
+        return MappingProxyType(found)
 
     @property
     def parts(self) -> list[Augmentation]:

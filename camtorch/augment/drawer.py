@@ -89,7 +89,7 @@ class CameraDrawer(Augmentation):
     beside_the_camera: ClassVar[frozenset[str]] = frozenset({"chromatic", "vignetting", "cos4"})
     _usual_ranges: ClassVar[Mapping[str, RangeLike]] = {}
     """The ranges that "auto" stands for, of lenses that are not drawn from real ones."""
-    like: Camera | None
+    like: Any  # a Camera or None; the name of a preset or a model when it is set
 
     def __init__(
         self,
@@ -108,11 +108,6 @@ class CameraDrawer(Augmentation):
         self._memo = Kept(8)
         self.image_size: tuple[int, int] | None = as_image_size(image_size, self._name)
         self._is_real = isinstance(like, str) and like == _REAL
-        self.like = None if self._is_real else _as_like(like, self._name)
-        if self.like is not None and self.like.image_size is None and fov is None:
-            raise ValueError(
-                f"{self._name}: like must have an image_size, or fov be given; got like={like!r}. Pass fov=(low, high)"
-            )
         usual = {} if self._is_real else self._usual_ranges
         values = {n: usual.get(n) if n in _AUTO and isinstance(v, str) and v == "auto" else v for n, v in given.items()}
         values |= {"chromatic": chromatic, "vignetting": vignetting, "cos4": cos4}
@@ -128,6 +123,23 @@ class CameraDrawer(Augmentation):
             check_degrees(self.ranges["fov"].low, fov, self._name)
         among = self.ranges.pop("fov", None) if self._is_real else None
         self._among = None if among is None else (among.low, among.high)
+        self.like = None if self._is_real else like
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "fov" and value not in (None, "source"):
+            how = f"Set ranges['fov'] = ct.augment.Range(low, high), or make a new {self._name}"
+            raise ValueError(f"{self._name}: fov must be None or 'source', once it is made; got {value!r}. {how}")
+        if name == "like":
+            given, value = value, _as_like(value, self._name)
+            if value is not None and self._is_real:
+                got = f"one that was made with 'real'. Make a new {self._name}"
+                raise ValueError(f"{self._name}: like must stay None in {got}; got {given!r:.60}")
+            if value is not None and value.image_size is None and self.fov is None and "fov" not in self.ranges:
+                raise ValueError(
+                    f"{self._name}: like must have an image_size, or fov be given; got like={given!r}. Pass fov=(low, "
+                    "high)"
+                )
+        super().__setattr__(name, value)
 
     @property
     def drawn_on_host(self) -> bool:  # type: ignore[override]
@@ -211,7 +223,8 @@ class CameraDrawer(Augmentation):
 
     def _key(self, source: Camera, names: Iterable[str], share: float | None) -> tuple[Any, ...]:
         """Return all else that what new cameras are drawn from depends on."""
-        return "start", type(source), source.image_size, self._size_of(source), *names, self.ranges.get("fov"), share
+        own = self._version, self.like and self.like.image_size, self.ranges.get("fov"), share
+        return "start", type(source), source.image_size, self._size_of(source), *names, *own
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._values(source, draw)
@@ -237,16 +250,15 @@ class CameraDrawer(Augmentation):
         key = self._key(batch.camera, self.ranges, self.min_filled)
         known = self._memo.entry(self._tensors_of(batch.camera), key)
         if known is not None and known[2] is not None and known[2].is_quick and known[2].names == [*self.ranges]:
-            options, ranges, *more = self._settings()
+            options, *more = self._settings()
             rest = [(name, found) for name, found in form.fields if name not in names]
             checked = [(name, found) for name, found in rest if found in CHECKED]  # the call looks at the others
             turns = all(name != "rotation" for name, _ in form.fields)
-            form.ready = Ready(({**options}, {**ranges}, *more), key, names, call, rest, checked, turns)
+            form.ready = Ready(({**options}, *more), key, names, call, rest, checked, turns)
 
     def _settings(self) -> tuple[Any, ...]:
         """Return what the calls for samples of a form depend on, in addition to the form and the cameras' numbers."""
-        own = self.mask_fill, self.min_filled, self.image_size, self.valid_mask, self.like
-        return self.options, self.ranges, *own
+        return self.options, [*self.ranges.items()], self._version, self.like and self.like.image_size
 
     def _quickly(self, sample: Sample, generator: torch.Generator | None) -> tuple[Sample | None, Any]:
         camera = self.camera if (given := sample.get("camera")) is None else given
@@ -260,7 +272,7 @@ class CameraDrawer(Augmentation):
         if ready.settings != settings:
             form.is_tried, form.ready = False, None
             return None, None
-        options, *_, like = settings
+        options, like = self.options, self.like
         gate, shares, spans = draw_shares(self.ranges, 1, self.p, generator, self._spans)
         self.__dict__["_spans"] = spans
         applied, numbers = self.p >= 1 if gate is None else bool(gate), spans.numbers(shares.tolist())
@@ -338,7 +350,7 @@ class CameraDrawer(Augmentation):
         if asked is None or key in _told or not known_false(factor <= 1):
             return
         zoomed = target()
-        made = _across(zoomed)
+        made = _across(zoomed).expand_as(factor)
         least = torch.minimum(_across(scaled(zoomed, 1 / factor)), torch.full_like(made, asked))
         # what cannot be filled at all has a warning of its own
         less = (made < _LESS * least) & (factor > 1) & (found >= share)
@@ -392,7 +404,7 @@ class CameraDrawer(Augmentation):
             whole = remade(base, intrinsics=sized.to(base.intrinsics.dtype), image_size=size)
             return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
 
-        key = "source", type(source), source.image_size, size
+        key = "source", type(source), source.image_size, type(base), base.image_size, size
         return self._memo(source._tensors + base._tensors, key, narrowed)
 
 

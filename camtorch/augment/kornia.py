@@ -99,11 +99,15 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         self.flags["padding_mode"] = SamplePadding.get(options["padding_mode"])
         if (size := augmentation.size_after(own_size)) != own_size:
             self.flags["size"] = size
-        self._kind = kind_of_camera(camera)
         self.keypoints_valid: Tensor | None = None
         """(B, N) bool: whether the keypoints that were moved last lie on their image."""
         # two memos: lists of masks are moved row by row between other labels of the batch
         self._memos = Kept(), Kept()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        super().__setattr__(name, value)
+        if name == "camera":
+            self._kind = kind_of_camera(self.camera)
 
     def set_rng_device_and_dtype(self, device: torch.device, dtype: torch.dtype) -> None:
         """Keep draws on the CPU: a seed then draws the same on every device, and reading params needs no wait."""
@@ -138,8 +142,10 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         camera = camera_of(params, self.camera, device)
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
         inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
-        memo, options = self._memos[len(values["apply"]) == 1], (str(self.augmentation.options),)
-        return memo.unless_learning(inputs, options, lambda: self.augmentation.change(camera, values))
+        parts = [vars(part) for part in self.augmentation.modules()]
+        state = [(own.get("_version"), str(own.get("options")), own.get("image_size")) for own in parts]
+        memo, key = self._memos[len(values["apply"]) == 1], (type(camera), camera.image_size, *state)
+        return memo.unless_learning(inputs, key, lambda: self.augmentation.change(camera, values))
 
     @property
     def last(self) -> Change | None:
@@ -218,7 +224,8 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         return transform
 
     def __getstate__(self) -> dict[str, Any]:
-        return cast("dict[str, Any]", detached(self.__dict__))  # params of a graph could be neither copied nor pickled
+        # params of a graph could be neither copied nor pickled
+        return cast("dict[str, Any]", detached(super().__getstate__()))
 
     def __repr__(self) -> str:
         ranges = "".join(f"{name}={interval}, " for name, interval in self.augmentation.ranges.items())

@@ -85,7 +85,7 @@ class Spans:
     """Ranges, ready to draw a value of each for some samples."""
 
     def __init__(self, ranges: Mapping[str, Range], rows: int):
-        self.ranges: dict[str, Range] = dict(ranges)
+        self.ranges = [*ranges.items()]  # values are drawn in their order
         self.rows = rows
         self._places: list[tuple[str, slice, tuple[int, int] | None]] = []
         self._ends: list[tuple[float, float]] = []
@@ -149,7 +149,7 @@ def draw_shares(
     """
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
-    if spans is None or spans.rows != rows or spans.ranges != ranges:
+    if spans is None or spans.rows != rows or spans.ranges != [*ranges.items()]:
         spans = Spans(ranges, rows)
     device = "cpu" if generator is None else generator.device
     gate = torch.rand(rows, generator=generator, dtype=torch.float32, device=device) < p if 0 < p < 1 else None

@@ -7,6 +7,7 @@ import copy
 import difflib
 import functools
 import inspect
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -97,6 +98,7 @@ class KeepsCamera:
     """Keeps a copy of a `camera`, and of one that is `like` others, whenever it is set; the copy does not learn."""
 
     _name: str = ""  # in errors; empty: that of the class
+    _version: int = 0  # another one whenever a public attribute is set: results are kept by it
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "camera" and not (value is None or isinstance(value, Camera)):
@@ -109,7 +111,17 @@ class KeepsCamera:
                 learns = [key for key, tensor in part._parameters.items() if tensor is not None]
                 for key in learns if isinstance(part, GeometryModule) else ():
                     part.put(key, cast("Tensor", part._parameters.pop(key)).detach(), persistent=True)
+        if name[:1] != "_" and self.__dict__.get(name, self) is not value and not torch.compiler.is_compiling():
+            self.__dict__["_version"] = next(_versions)
         super().__setattr__(name, value)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in _OF_CALLS}
+
+
+_versions = itertools.count(1)
+_OF_CALLS = frozenset(("_version", "_last", "_is_first", "_warned", "_spans"))
+"""What calls leave: a used object pickles to the bytes of an unused one, by which caches know it."""
 
 
 def on_samples(method: Callable[P, R]) -> Callable[P, R]:
@@ -194,8 +206,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         if wrong := {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}:
             raise ValueError(f"{self._name}: fields must map names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
         self.options: Options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
-        # None where each warp says
-        self.antialias: bool | None = None if antialias is None else self.options["antialias"]
+        self.antialias = antialias
         self.mask_fill: float = as_number(mask_fill, "mask_fill", self._name)
         self.valid_mask: bool = as_flag(valid_mask, "valid_mask", self._name)
         self._forms = Kept(16)
@@ -226,6 +237,16 @@ class SampleTransform(KeepsCamera, nn.Module):
         kin = (one for base in cls.__mro__[1:-2] for one in (base, *base.__subclasses__()))
         has = next((one.__name__ for one in kin if word in _keywords(one)), None)
         return f"{meant} are {', '.join(known)}" + (f". {has} has it" if has else "")
+
+    @property
+    def antialias(self) -> bool | None:
+        """The option of that name; None if each warp decides."""
+        return self.options["antialias"] if self.__dict__["antialias"] is not None else None
+
+    @antialias.setter
+    def antialias(self, value: bool | None) -> None:
+        self.__dict__["antialias"] = value
+        self.options["antialias"] = value is not None and as_flag(value, "antialias", self._name)
 
     mirroring: Mirroring | None = None  # what changes places where an augmentation mirrors; None: it never does
     needs_camera: bool = True  # whether samples, or it, need a camera; edits do not
@@ -331,7 +352,7 @@ class SampleTransform(KeepsCamera, nn.Module):
                 parts += name, type(value)
             else:
                 return None
-        return *parts, *fields.items()
+        return *parts, self._version, *fields.items()
 
     def _checked_batch(self, sample: Sample, camera: Any, fields: Mapping[str, str], predicted: bool) -> Batch:
         if not (named := self._sorted(sample, fields)):

@@ -201,7 +201,7 @@ class Mixed(Camera):
             found = kept_cameras(group.memo, group.model, intrinsics, distortion)
             if found.usable is not None:
                 for member in map(self._member, group.members):
-                    if not member._warned:
+                    if not (member._warned or member._told):
                         lead = member.batch_shape
                         camera_rows(member, *(per_row(t.to(intrinsics), lead, t) for t in member._tensors))
             return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -86,9 +86,14 @@ class Seeded:
             raise TypeError(f"Seeded: augmentation must be {wanted}; got {type(inner).__name__}")
         if inner.same_on_batch:
             raise ValueError("Seeded: same_on_batch must be False, because no draw depends on the batch here; got True")
-        self.augmentation, self._inner = augmentation, inner
+        self.augmentation = augmentation
         # in shared memory, so that running processes see a new epoch
         self._numbers = torch.tensor([_number(seed, "seed"), _number(epoch, "epoch")]).share_memory_()
+
+    @property
+    def _inner(self) -> Augmentation:
+        own = self.augmentation
+        return cast("Augmentation", own.augmentation) if isinstance(own, Transform) else own
 
     @property
     def seed(self) -> int:

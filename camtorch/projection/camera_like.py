@@ -21,7 +21,8 @@ class CameraLike(ModelSpec, BatchedModule):
     _memo: Kept
     _rays: Kept
     _fields: Kept
-    _warned: bool
+    _warned: bool  # whether unusable numbers are expected, as a network's
+    _told: bool = False  # whether a call has warned of them
 
     if TYPE_CHECKING:
         intrinsics: Tensor

@@ -147,12 +147,12 @@ def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> Camer
     """Return the rows' cameras, kept until a value changes."""
     cameras = kept_cameras(camera._memo, type(camera), intrinsics, distortion)
     # reading values would wait for another device
-    if cameras.usable is not None and cameras.usable.is_cpu and not camera._warned:
+    if cameras.usable is not None and cameras.usable.is_cpu and not (camera._warned or camera._told):
         # warn once if learning drove this module's Parameters to where no camera is, from which no gradient leads back
         bad = (cameras.usable <= 0).flatten().nonzero()
         found = unusable(camera, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
         if found is not None and isinstance(getattr(camera, found[0]), nn.Parameter):
-            camera._warned = True
+            camera._told = True
             name = parametrize.type_before_parametrizations(camera).__name__
             where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
             keeps = "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
