@@ -7,7 +7,6 @@ import copy
 import difflib
 import functools
 import inspect
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -98,7 +97,6 @@ class KeepsCamera:
     """Keeps a copy of a `camera`, and of one that is `like` others, whenever it is set; the copy does not learn."""
 
     _name: str = ""  # in errors; empty: that of the class
-    _version: int = 0  # another one whenever a public attribute is set: results are kept by it
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "camera" and not (value is None or isinstance(value, Camera)):
@@ -111,15 +109,12 @@ class KeepsCamera:
                 learns = [key for key, tensor in part._parameters.items() if tensor is not None]
                 for key in learns if isinstance(part, GeometryModule) else ():
                     part.put(key, cast("Tensor", part._parameters.pop(key)).detach(), persistent=True)
-        if name[:1] != "_" and self.__dict__.get(name, self) is not value and not torch.compiler.is_compiling():
-            self.__dict__["_version"] = next(_versions)
         super().__setattr__(name, value)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name not in _OF_CALLS}
 
 
-_versions = itertools.count(1)
 _OF_CALLS = frozenset(("_version", "_last", "_is_first", "_warned", "_spans"))
 """What calls leave: a used object pickles to the bytes of an unused one, by which caches know it."""
 
@@ -185,6 +180,7 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     other_words: ClassVar[Mapping[str, str]] = {}
     """Words that people try as keywords -> the keyword, for the hint of an error."""
+    _version: object = None  # another one whenever a public attribute is set: results are kept by it
 
     def __init__(
         self,
@@ -237,6 +233,11 @@ class SampleTransform(KeepsCamera, nn.Module):
         kin = (one for base in cls.__mro__[1:-2] for one in (base, *base.__subclasses__()))
         has = next((one.__name__ for one in kin if word in _keywords(one)), None)
         return f"{meant} are {', '.join(known)}" + (f". {has} has it" if has else "")
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name[:1] != "_" and self.__dict__.get(name, self) is not value:
+            self.__dict__["_version"] = object()
+        super().__setattr__(name, value)
 
     @property
     def antialias(self) -> bool | None:
