@@ -223,7 +223,7 @@ class CameraDrawer(Augmentation):
 
     def _key(self, source: Camera, names: Iterable[str], share: float | None) -> tuple[Any, ...]:
         """Return all else that what new cameras are drawn from depends on."""
-        own = self._version, self.like and self.like.image_size, self.ranges.get("fov"), share
+        own = self._revision, self.like and self.like.image_size, self.ranges.get("fov"), share
         return "start", type(source), source.image_size, self._size_of(source), *names, *own
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
@@ -258,7 +258,7 @@ class CameraDrawer(Augmentation):
 
     def _settings(self) -> tuple[Any, ...]:
         """Return what the calls for samples of a form depend on, in addition to the form and the cameras' numbers."""
-        return self.options, [*self.ranges.items()], self._version, self.like and self.like.image_size
+        return self.options, [*self.ranges.items()], self._revision, self.like and self.like.image_size
 
     def _quickly(self, sample: Sample, generator: torch.Generator | None) -> tuple[Sample | None, Any]:
         camera = self.camera if (given := sample.get("camera")) is None else given

@@ -143,7 +143,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
         inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
         parts = [vars(part) for part in self.augmentation.modules()]
-        state = [(own.get("_version"), str(own.get("options")), own.get("image_size")) for own in parts]
+        state = [(own.get("_revision"), str(own.get("options")), own.get("image_size")) for own in parts]
         memo, key = self._memos[len(values["apply"]) == 1], (type(camera), camera.image_size, *state)
         return memo.unless_learning(inputs, key, lambda: self.augmentation.change(camera, values))
 

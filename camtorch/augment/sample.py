@@ -115,7 +115,7 @@ class KeepsCamera:
         return {name: value for name, value in self.__dict__.items() if name not in _OF_CALLS}
 
 
-_OF_CALLS = frozenset(("_version", "_last", "_is_first", "_warned", "_spans"))
+_OF_CALLS = frozenset(("_revision", "_last", "_is_first", "_warned", "_spans"))
 """What calls leave: a used object pickles to the bytes of an unused one, by which caches know it."""
 
 
@@ -180,7 +180,7 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     other_words: ClassVar[Mapping[str, str]] = {}
     """Words that people try as keywords -> the keyword, for the hint of an error."""
-    _version: object = None  # another one whenever a public attribute is set: results are kept by it
+    _revision: object = None  # another one whenever a public attribute is set: results are kept by it
 
     def __init__(
         self,
@@ -236,7 +236,7 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name[:1] != "_" and self.__dict__.get(name, self) is not value:
-            self.__dict__["_version"] = object()
+            self.__dict__["_revision"] = object()
         super().__setattr__(name, value)
 
     @property
@@ -353,7 +353,7 @@ class SampleTransform(KeepsCamera, nn.Module):
                 parts += name, type(value)
             else:
                 return None
-        return *parts, self._version, *fields.items()
+        return *parts, self._revision, *fields.items()
 
     def _checked_batch(self, sample: Sample, camera: Any, fields: Mapping[str, str], predicted: bool) -> Batch:
         if not (named := self._sorted(sample, fields)):
