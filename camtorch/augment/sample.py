@@ -46,6 +46,7 @@ from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free, in_worker, is_unknown
 from camtorch.models import Pinhole
+from camtorch.native.library import tell_if_missing
 from camtorch.values.arguments import (
     CLOSE,
     GUESS_CAMERA,
@@ -383,6 +384,8 @@ class SampleTransform(KeepsCamera, nn.Module):
         held = {name: v for name, (_, value) in named.items() for v in (value if isinstance(value, list) else [value])}
         check_devices(self._name, **held)
         device, camera = next((v.device for v in held.values()), torch.device("cpu")), alone(as_one(camera))
+        if device.type == "cpu" and are_free():
+            tell_if_missing()
         if camera.intrinsics.device != device:
             own, camera = camera, camera.each(lambda t: t.to(device))
             if own.intrinsics.is_cpu and not is_unknown(own.intrinsics):

@@ -5,50 +5,65 @@ from __future__ import annotations
 import ctypes
 import functools
 import os
-import warnings
 from pathlib import Path
 
 from camtorch.native.build import LIBRARY, REASON, VARIANTS, checksum, switched_off
 
 _HERE = Path(__file__).resolve().parent
 _BUILD = "python -m camtorch.native.build"
+# 78 of the 94 rows of docs/performance.json with both figures are within these
+_SLOWER = "without it most work on the CPU takes 4 to 80 times as long"
+_told: set[str] = set()
 
 
 @functools.cache
-def _find() -> tuple[ctypes.CDLL | None, str, bool]:
-    """Return the library, its CPU's kind or why there is none, and whether it is there but stale."""
+def _find() -> tuple[ctypes.CDLL | None, str]:
+    """Return the library, and its CPU's kind or why there is none."""
     if switched_off():
-        return None, "off (CAMTORCH_NATIVE=0)", False
+        return None, "off (CAMTORCH_NATIVE=0)"
     path = _HERE / LIBRARY
     if not path.exists():
         reason = _HERE / REASON
         why = reason.read_text("utf-8").strip() if reason.exists() else "camtorch was not installed from here"
-        return None, f"not built ({why}); with a C compiler `{_BUILD}` builds it", False
+        return None, f"not built ({why}); with a C compiler `{_BUILD}` builds it; {_SLOWER}"
     try:
         library = ctypes.CDLL(str(path))
     except OSError as error:
-        return None, f"not loaded ({error}); `{_BUILD}` builds it again", False
+        return None, f"not loaded ({error}); `{_BUILD}` builds it again; {_SLOWER}"
     here, built_from = checksum(), getattr(library, "camtorch_sources", None)
     if built_from is not None:
         built_from.restype = ctypes.c_uint32
     if here is not None and (built_from is None or built_from() != here):  # None if a package leaves the sources out
         why = "not used (built from other sources than those beside it)"
-        return None, f"{why}; `{_BUILD}` or `pip install -e .` builds it again", True
+        return None, f"{why}; `{_BUILD}` or `pip install -e .` builds it again; {_SLOWER}"
     wanted = os.environ.get("CAMTORCH_CPU", "").strip().lower()
     if wanted and not library.camtorch_use(wanted.encode()):
         names = ", ".join(name for name in VARIANTS if library.camtorch_use(name.encode()))
         raise ValueError(f"CAMTORCH_CPU must be one of {names} on this CPU; got {wanted!r}. Unset it to use the best")
     library.camtorch_variant.restype = ctypes.c_char_p
-    return library, library.camtorch_variant().decode(), False
+    return library, library.camtorch_variant().decode()
 
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
     """Return the library, loaded at first use, or None if there is none to use; its calls do not hold Python's lock."""
-    found, why, is_stale = _find()
-    if is_stale:
-        warnings.warn(f"camtorch's native sampler is {why}", RuntimeWarning, stacklevel=2)
-    return found
+    return _find()[0]
+
+
+def tell_if_missing() -> None:
+    """Warn, once a process, that long work is done without the library, unless CAMTORCH_NATIVE=0 says so.
+
+    Of a DataLoader's workers the first one warns.
+    """
+    if _told or library() is not None or switched_off():
+        return
+    from torch.utils.data import get_worker_info  # `camtorch --version` takes no time to import torch
+
+    from camtorch.values.arguments import warn
+
+    _told.add(state())
+    if (worker := get_worker_info()) is None or worker.id == 0:
+        warn(f"camtorch's compiled library is {state()}. CAMTORCH_NATIVE=0 in the environment says that it is meant so")
 
 
 def state() -> str:
