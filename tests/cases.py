@@ -171,7 +171,7 @@ PROGRAMS |= {
     "CameraHead": Case(HEAD, lambda head, features, points: head(features).project(points), rand(2, 6), POINTS),
     "losses.angles": Case(nn.Identity(), lambda _, a, b: losses.angles(a, b), POINTS, POINTS.flip(0)),
     "losses.rays": Case(PAIR, lambda pair: losses.rays(pair[0], pair[1])),
-    "losses.reprojection": Case(PAIR, lambda pair: losses.reprojection(pair[0], pair[1])),
+    "losses.reprojection": Case(PAIR, lambda pair: losses.reprojection(pair[0], pair[1], penalty=50)),
     "project": Case(FISHEYE, lambda c, points, pixels: (c.project(points), c.unproject(pixels)), POINTS, PIXELS),
 }
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from camtorch.augment.change import Drawn
 from camtorch.augment.filling import looked_at, with_care
-from camtorch.augment.jitter import DRAWN, PARTS, border, defined_or, lens_ends, measured_once, sensitivity
+from camtorch.augment.jitter import DRAWN, PARTS, border, lens_ends, measured_once, sensitivity
 from camtorch.cameras.camera import Camera
 from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.projection.evaluation import rows_of
@@ -31,6 +31,7 @@ from camtorch.projection.native_cameras import (
     lenses_of,
 )
 from camtorch.projection.rows import CameraRows, domain_for, single_native
+from camtorch.rays.lattices import defined_or
 from camtorch.values.module import model_of, remade
 from camtorch.warp.sampling import Options
 

@@ -13,8 +13,7 @@ from torch import Tensor
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import CameraNumbers, opaque
 from camtorch.lenses.drawing import covering
-from camtorch.rays.lattices import pixel_lattice, polar_rays, reach
-from camtorch.values.arguments import broadcast_shapes
+from camtorch.rays.lattices import defined_or, movement, polar_rays, reach
 from camtorch.values.module import remade
 from camtorch.warp.boxes import along_edges
 
@@ -23,7 +22,6 @@ DRAWN = 16
 PARTS = 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125
 """Parts of a step, in the order in which they are tried."""
 _SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move less than radial terms: as in real lenses
-_STEP = 1e-4
 _MOST_MEASURED = 64  # lenses
 
 
@@ -88,44 +86,12 @@ def measured_once(measure: Callable[..., Tensor], camera: Camera, *inputs: Tenso
 
 def sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
     """Return how much to change each coefficient, (*B, n), so that the rim moves from centre to corner."""
-    count, size = distortion.shape[-1], camera._size_for("its sensitivity")
-    batch = broadcast_shapes(nominal.shape[:-1], distortion.shape[:-1])
-    intrinsics, k = (
-        t.detach().double().expand(*batch, t.shape[-1]).reshape(-1, t.shape[-1]) for t in (nominal, distortion)
-    )
-    pixels = _over(size).to(k.device).expand(len(k), -1, -1)
-    rays, seen = remade(camera, intrinsics=intrinsics, distortion=k).unproject(pixels)
-    # each coefficient less, then each more; the same lenses stand before any part of an image
-    change = _STEP * torch.eye(count, dtype=torch.float64, device=k.device)
-    lenses, _ = defined_or(camera, k[:, None] + torch.cat((-change, change)), k[:, None])
-    many = [t.repeat_interleave(2 * count, 0) for t in (intrinsics, rays)]
-    ends, valid = remade(camera, intrinsics=many[0], distortion=lenses.flatten(0, 1)).project(many[1])
-    # (B, less and more, n, N, 2), and plain arithmetic on a few numbers
-    places, known = (t.unflatten(0, (-1, 2, count)).cpu().numpy() for t in (ends, valid))
-    moved = np.linalg.norm(places[:, 1] - places[:, 0], axis=-1) / (2 * _STEP)
-    most = np.where(known.all(1) & seen.cpu().numpy()[:, None], moved, 0.0).max(-1)
+    most = movement(camera, distortion, nominal).numpy()
     odd = camera.odd_in_x | camera.odd_in_y
     lopsided = np.array([name in odd for name in camera.distortion_names], bool)
     share = np.where(lopsided, np.float32(_SMALL), np.float32(1)) / np.float32(max((~lopsided).sum(), 1))
-    corner = math.hypot(size[1] / 2, size[0] / 2)
-    measured = share * np.where(most > 0, corner / most.clip(min=1e-30), 0.0)
-    return torch.from_numpy(measured.reshape(*batch, count)).to(k.device)
-
-
-@lru_cache(maxsize=16)
-def _over(size: tuple[int, int]) -> Tensor:
-    """Return pixels (N, 2) in float64, in even steps over images of a size, to their outer edges."""
-    with torch.inference_mode(False):
-        edges = torch.tensor([[-0.5, -0.5], [size[1] - 0.5, size[0] - 0.5]], dtype=torch.float64)
-        return pixel_lattice(edges[0], edges[1], 9, 9).flatten(0, 1)
-
-
-def defined_or(camera: Camera, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Return coefficients (*B, n), `otherwise` for undefined ones, and which are defined, (*B,); None if all are."""
-    sense = camera.defined(distortion.unbind(-1))
-    if sense is None:
-        return distortion, None
-    return torch.where((sense > 0).unsqueeze(-1), distortion, otherwise), sense > 0
+    corner = math.hypot(*camera._size_for("the effect of its coefficients")) / 2
+    return torch.from_numpy(share * np.where(most > 0, corner / most.clip(min=1e-30), 0.0)).to(distortion.device)
 
 
 def _rim(camera: Camera) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
@@ -28,9 +29,9 @@ from camtorch.projection.unproject import UNPROJECT
 from camtorch.rays.depth import backproject
 from camtorch.rays.explanation import explain
 from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
-from camtorch.rays.lattices import field_of_view
+from camtorch.rays.lattices import field_of_view, movement
 from camtorch.rays.polyline import project_polyline
-from camtorch.values.arguments import Numbers, broadcast_shapes, hinting, warn
+from camtorch.values.arguments import Numbers, as_number, broadcast_shapes, hinting, warn
 from camtorch.values.module import GeometryModule, typed_as
 
 Model = TypeVar("Model", bound="Camera", default="Camera")
@@ -246,6 +247,49 @@ class Camera(Freezable, Editable):
             ValueError, TypeError: If the constructor would raise them.
         """
         return replaced(self, intrinsics, distortion, image_size)
+
+    def parameter_groups(self, lr: float = 1.0) -> list[dict[str, Any]]:
+        """Return groups of parameters for an optimizer: `torch.optim.Adam(camera.parameter_groups(lr=0.5))`.
+
+        A step of Adam, AdamW or RMSprop then moves intrinsics by about `lr` pixels. The coefficient with the largest
+        effect moves the image's rim by as much; the others, in the same tensor, move it less. A batch has the lr of its
+        most sensitive camera. There is no weight decay, which pulls focal lengths and coefficients to zero. SGD
+        multiplies lr by the gradient, which is large for coefficients, and folds the lens. Call it after `freeze`.
+
+        Args:
+            lr: Pixels.
+
+        Raises:
+            ValueError: If nothing learns, `lr` is not positive, or there are coefficients and no image_size.
+            TypeError: If a network predicted the camera, or it was made from one that learns.
+        """
+        owner, steps = f"{type(self).__name__}.parameter_groups", dict[Tensor, float]()
+        if not 0 < (lr := as_number(lr, "lr", owner)) < math.inf:
+            raise ValueError(f"{owner}: lr must be a positive number of pixels; got {lr!r}")
+        for camera in (part for part in self.modules() if isinstance(part, Camera) and not part.is_mixed):
+            parts: Any = camera._modules.get("parametrizations", {})
+            for name in camera.tensor_names:
+                held: Any = (
+                    parts[name].parameters() if name in parts else [{**camera._buffers, **camera._parameters}[name]]
+                )
+                for tensor in (t for t in held if t.requires_grad):
+                    if not tensor.is_leaf:
+                        instead = "Pass the parameters of the network or camera that it is made of to the optimizer"
+                        raise TypeError(f"{owner}: {name} must be a Parameter; got a tensor of a graph. {instead}")
+                    steps[tensor] = min(lr / camera._effect(name, tensor), steps.get(tensor, math.inf))
+        if not steps:
+            raise ValueError(f"{owner}: camera must learn; got a fixed one. Call camera.requires_grad_() before")
+        return [{"params": [tensor], "lr": step, "weight_decay": 0.0} for tensor, step in steps.items()]
+
+    def _effect(self, name: str, tensor: Tensor) -> float:
+        """Return by how many pixels one unit of a number of `tensor`, which `name` is made of, moves it at most."""
+        given = name == "intrinsics"
+        weights = torch.ones(4) if given else movement(self, self.distortion, self.intrinsics, lattice=33)
+        count = weights.shape[-1]
+        with torch.enable_grad():
+            pixels = (getattr(self, name) * weights.reshape(-1, count).amax(0).to(tensor)).reshape(-1, count).sum(0)
+            moved = [torch.autograd.grad(one, tensor, retain_graph=True)[0].abs().amax() for one in pixels]
+        return max(map(float, moved)) or 1e3  # small steps without an effect, like that of FOV's omega at 0
 
     @property
     def batch_shape(self) -> torch.Size:

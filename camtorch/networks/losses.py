@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal, TypedDict, overload
 
@@ -14,6 +15,7 @@ from camtorch.values.arguments import (
     Numbers,
     as_batch,
     as_coordinates,
+    as_number,
     as_values,
     as_whole,
     broadcast_shapes,
@@ -50,6 +52,10 @@ class _Points(TypedDict, total=False):
 
 class _Pixels(_Points, total=False):
     pixels: Numbers | None
+
+
+class _Seen(_Points, total=False):
+    penalty: float | None
 
 
 @overload
@@ -110,7 +116,7 @@ def reprojection(
     points: Tensor | None = None,
     *,
     reduction: Literal["mean"] = "mean",
-    **options: Unpack[_Points],
+    **options: Unpack[_Seen],
 ) -> Tensor: ...
 
 
@@ -121,7 +127,7 @@ def reprojection(
     points: Tensor | None = None,
     *,
     reduction: Literal["none"],
-    **options: Unpack[_Points],
+    **options: Unpack[_Seen],
 ) -> tuple[Tensor, Tensor]: ...
 
 
@@ -132,11 +138,13 @@ def reprojection(
     *,
     samples: int | tuple[int, int] = 16,
     weights: Numbers | None = None,
+    penalty: float | None = None,
     reduction: Literal["mean", "none"] = "mean",
 ) -> Tensor | tuple[Tensor, Tensor]:
     """Return the distances in pixels between the projections of points by the predicted camera and by the target.
 
-    Points that the predicted camera does not see do not count, and do not pull it; `rays` counts the whole image.
+    A point that the predicted camera does not see has no gradient, and by default it does not count: the loss falls if
+    a lens folds over its points. Pass a `penalty` in training, so that each lost point shows.
 
     Args:
         predicted: Cameras with batch dims *B.
@@ -144,13 +152,17 @@ def reprojection(
         points: (*B, *N, 3) in the camera's frame; the rays of the target's own image if left out, see `samples`.
         samples: See `rays`.
         weights: See `rays`.
+        penalty: Distance in pixels of a point that the target sees and the predicted camera does not, like the diagonal
+            of the image. The mean is then over the points that the target sees, and each lost one raises it unless it
+            was farther off. None: the mean is over points that both see.
         reduction: See `rays`.
 
     Returns:
-        The mean distance over points that both see, or distances (*B, *N) and valid; see `rays`.
+        The mean distance over points, or distances (*B, *N) and which of them count; see `rays`.
 
     Raises:
-        ValueError: If there are pixels without points, or `rays` would raise. TypeError: If `predicted` is no camera.
+        ValueError: If there are pixels without points, the penalty is not positive, or `rays` would raise.
+        TypeError: If `predicted` is no camera.
     """
     owner = "losses.reprojection"
     if isinstance(target, Camera):
@@ -173,8 +185,15 @@ def reprojection(
     except RuntimeError:
         got = f"{tuple(pixels.shape)} and {tuple(found.shape)}"
         raise ValueError(f"{owner}: pixels of target and of the points must broadcast; got {got}") from None
-    # a point without a pixel has a distance without a gradient
-    return _reduce(torch.linalg.vector_norm(off, dim=-1), valid & seen, weights, reduction, owner)
+    distances = torch.linalg.vector_norm(off, dim=-1)  # without a gradient for a point that has no pixel
+    if penalty is None:
+        return _reduce(distances, valid & seen, weights, reduction, owner)
+    if not 0 < as_number(penalty, "penalty", owner) < math.inf:
+        raise ValueError(f"{owner}: penalty must be a positive number of pixels; got {shown(penalty)}")
+    # no camera sees a point without a direction, such as the zeros that fill up a batch
+    size = as_values(points, "points", owner, predicted.intrinsics.device).detach().abs().amax(-1)
+    seen = (seen & size.isfinite() & (size > 0)).expand(distances.shape)
+    return _reduce(torch.where(valid, distances, float(penalty)), seen, weights, reduction, owner)
 
 
 def _check(predicted: Camera, target: Camera, owner: str) -> torch.Size:

@@ -1,17 +1,19 @@
-"""Samples of a camera: lattices of pixels and fans of rays; and its field of view and slopes at the axis."""
+"""Samples of a camera: lattices of pixels and fans of rays; its field of view, and how far coefficients move it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from camtorch.optics.derivatives import jacobian_of
 from camtorch.projection.camera_like import CameraLike
-from camtorch.values.arguments import columns
+from camtorch.values.arguments import broadcast_shapes, columns
 from camtorch.values.module import remade
 
 if TYPE_CHECKING:
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 AXES = ("horizontal", "vertical", "diagonal")  # of an image, along which a field of view is measured
 
 _LINE = 513  # points along a line of the image
+_STEP = 1e-4  # of a coefficient
 
 
 def image_edges(image_size: tuple[int, int], like: Tensor) -> tuple[Tensor, Tensor]:
@@ -76,6 +79,46 @@ def slopes_at_axis(optics: Optics, k: Tensor) -> Tensor:
     across, _, _, down = jacobian_of(to_sensor, zero, zero)
     slopes = torch.cat((across, down), -1)
     return torch.where(torch.isfinite(slopes) & (slopes > 0), slopes, 1.0)
+
+
+def movement(camera: CameraLike, distortion: Tensor, nominal: Tensor, lattice: int = 9) -> Tensor:
+    """Return by how many pixels one unit of each coefficient (*B, n) moves the image at most, float64 on the CPU.
+
+    The lens has `nominal` intrinsics, and is tried at so many rows and columns: finer ones come nearer to a lens's end.
+    """
+    count, size = distortion.shape[-1], camera._size_for("the effect of its coefficients")
+    batch = broadcast_shapes(nominal.shape[:-1], distortion.shape[:-1])
+    intrinsics, k = (
+        t.detach().double().expand(*batch, t.shape[-1]).reshape(-1, t.shape[-1]) for t in (nominal, distortion)
+    )
+    pixels = _over(size, lattice).to(k.device).expand(len(k), -1, -1)
+    rays, seen = remade(camera, intrinsics=intrinsics, distortion=k).unproject(pixels)
+    # each coefficient less, then each more; the same lenses stand before any part of an image
+    change = _STEP * torch.eye(count, dtype=torch.float64, device=k.device)
+    lenses, _ = defined_or(camera, k[:, None] + torch.cat((-change, change)), k[:, None])
+    many = [t.repeat_interleave(2 * count, 0) for t in (intrinsics, rays)]
+    ends, valid = remade(camera, intrinsics=many[0], distortion=lenses.flatten(0, 1)).project(many[1])
+    # (B, less and more, n, N, 2), and plain arithmetic on a few numbers
+    places, known = (t.unflatten(0, (-1, 2, count)).cpu().numpy() for t in (ends, valid))
+    moved = np.linalg.norm(places[:, 1] - places[:, 0], axis=-1) / (2 * _STEP)
+    most = np.where(known.all(1) & seen.cpu().numpy()[:, None], moved, 0.0).max(-1)
+    return torch.from_numpy(most.reshape(*batch, count))
+
+
+@lru_cache(maxsize=16)
+def _over(size: tuple[int, int], lattice: int) -> Tensor:
+    """Return pixels (N, 2) in float64, in even steps over images of a size, to their outer edges."""
+    with torch.inference_mode(False):
+        edges = image_edges(size, torch.empty(0, dtype=torch.float64))
+        return pixel_lattice(*edges, lattice, lattice).flatten(0, 1)
+
+
+def defined_or(camera: CameraLike, distortion: Tensor, otherwise: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Return coefficients (*B, n), `otherwise` for undefined ones, and which are defined, (*B,); None if all are."""
+    sense = camera.defined(distortion.unbind(-1))
+    if sense is None:
+        return distortion, None
+    return torch.where((sense > 0).unsqueeze(-1), distortion, otherwise), sense > 0
 
 
 def ideal(camera: CameraT) -> CameraT:

@@ -142,7 +142,7 @@ CASES |= {
     "fit": tried(lambda *given: ct.fit("kannala_brandt", *given), LATTICE, FISHEYE.unproject(LATTICE)[0].detach()),
     "losses.angles": tried(losses.angles, POINTS, POINTS.flip(0)),
     "losses.rays": tried(losses.rays, BATCH, BROWN),
-    "losses.reprojection": tried(losses.reprojection, BATCH, BROWN),
+    "losses.reprojection": tried(lambda *pair: losses.reprojection(*pair, penalty=50), BATCH, BROWN),
     "CameraHead": tried(lambda h, f: h(f), ct.CameraHead(6, "kannala_brandt", image_size=SIZE).double(), rand(2, 6)),
     "CanonicalCamera": augmented(ct.CanonicalCamera, focal=30),
     "augment.FaceNormalizer": augmented(augment.FaceNormalizer, 13, image_size=(16, 16), distance=1, focal=40),

@@ -82,7 +82,8 @@ def warps(camera: ct.Camera) -> None:
     pair = ct.rectify(camera, camera, ct.Extrinsics([0, 0, 0], [-0.1, 0, 0]))
     assert_type((pair(images, images), pair.left), tuple[Pair, ct.Warp])
     assert_type((ct.losses.rays(camera, camera), ct.losses.rays(camera, camera, reduction="none")), tuple[Tensor, Pair])
-    assert_type(ct.losses.reprojection(camera, camera, torch.rand(5, 3), reduction="none"), Pair)
+    assert_type(ct.losses.reprojection(camera, camera, torch.rand(5, 3), reduction="none", penalty=800), Pair)
+    assert_type(camera.parameter_groups(lr=0.5), list[dict[str, Any]])
     assert_type(ct.solve_pnp(camera, np.random.rand(6, 3) + 2, np.random.rand(6, 2) * 400).rms, Tensor)
 
 

@@ -97,6 +97,18 @@ def test_reprojection_is_in_pixels():
     assert bool(torch.isfinite(predicted.intrinsics.grad).all())
 
 
+def test_a_lost_point_costs_the_penalty_without_a_gradient():
+    target = ct.BrownConrady([44.0, 44.0, 32.0, 23.0], [0.0] * 4, image_size=SIZE)
+    folded = target.replace(distortion=[-1.0, 0.0, 0.0, 0.0])
+    pixels = torch.cat((target.pixel_grid(4).flatten(0, 1), torch.tensor([[torch.nan, 0.0], [1.0, 1.0], [2.0, 2.0]])))
+    points = torch.cat((target.unproject(pixels[:193])[0], torch.tensor([[0.0] * 3, [torch.nan] * 3]))).detach()
+    share = folded.project(points[:192])[1].float().mean()
+    assert 0 < share < 1
+    loss, mean = (ct.losses.reprojection(folded, pixels, points, penalty=penalty) for penalty in (80, None))
+    torch.testing.assert_close(loss, share * mean + 80 * (1 - share))
+    torch.testing.assert_close(*(torch.autograd.grad(one, folded.distortion) for one in (loss, share * mean)))
+
+
 def test_cameras_of_several_models():
     predicted, target = cameras()
     mixed = ct.Mixed([target, ct.Pinhole([40.0, 40.0, 31.5, 23.5], image_size=SIZE).double()])

@@ -1,0 +1,67 @@
+"""Groups of a camera's parameters for an optimizer, and training with them: the loss is good only if the camera is."""
+
+import copy
+
+import pytest
+import torch
+from cameras import every_model, pixel_lattice, slow_unless, spread
+from torch.nn.utils import parametrize
+
+import camtorch as ct
+from camtorch.networks.parametrize import PositiveFocal
+
+FISHEYE = [310.0, 312, 322, 238, 0.02, -0.01, 0.003, -0.001, 3e-4, -1e-4, 0.001, -5e-4, 0.001, 3e-4, -0.001, -2e-4]
+LENSES = {"kannala_brandt": FISHEYE[:8], "fisheye62": FISHEYE[:12], "fisheye624": FISHEYE}
+LENSES |= {"brown_conrady": [420.0, 421, 323, 237, -0.1, 0.02, 0.001, -5e-4, 0], "ucm": [350.0, 351, 323, 237, 0.4]}
+OPTIMIZERS = {name: getattr(torch.optim, name) for name in ("Adam", "AdamW", "RMSprop", "SGD")}
+OPTIMIZERS["momentum"] = lambda groups: torch.optim.SGD(groups, momentum=0.9)
+QUICK = {("kannala_brandt", "AdamW"), ("brown_conrady", "momentum")}.__contains__
+
+
+def most_moved(camera, lr, count=None):
+    """Return by how many pixels a step of one of the first coefficients moves the image at most."""
+    rays, seen = camera.unproject(pixel_lattice(camera))
+    steps = lr * torch.eye(len(camera.distortion), dtype=torch.float64)[:count]
+    after, valid = camera.replace(distortion=camera.distortion + steps).project(rays.expand(len(steps), -1, 3))
+    return (after - camera.project(rays)[0]).norm(dim=-1)[valid & seen].max().item()
+
+
+@every_model
+def test_a_step_moves_the_image_by_lr_pixels(key):
+    near, camera = rows = spread(key), spread(key)
+    near.intrinsics.data[:2] *= 0.8
+    batch = copy.deepcopy(ct.cat(rows))  # with leaves of its own
+    for made, parts in ((camera, [camera]), (batch, rows)):
+        groups = made.parameter_groups(lr=0.01)
+        assert [id(*group["params"]) for group in groups] == [id(t) for t in made._tensors if t.requires_grad]
+        assert [groups[0]["lr"], *(group["weight_decay"] for group in groups)] == [0.01, *[0] * len(groups)]
+        for group in groups[1:]:  # a lens that ends on the image is measured a little inside
+            assert max(most_moved(part, group["lr"]) for part in parts) == pytest.approx(0.01, rel=0.25)
+
+
+def test_groups_of_what_learns_of_several_cameras():
+    lens, focal, fixed = spread("kannala_brandt"), spread("pinhole"), spread("ucm").requires_grad_(False)
+    parametrize.register_parametrization(focal, "intrinsics", PositiveFocal())
+    shared = lens.replace(intrinsics=[300.0, 300.0, 320.0, 240.0]).freeze("k3", "k4")
+    groups = ct.Mixed([lens.freeze("k3", "k4"), focal, fixed, shared]).parameter_groups(lr=0.01)
+    held = [*lens.parameters(), focal.parametrizations.intrinsics.original, shared.intrinsics]
+    assert [id(*group["params"]) for group in groups] == [id(t) for t in held]
+    assert most_moved(lens, groups[1]["lr"], 2) == pytest.approx(0.01, rel=0.25)
+    assert groups[2]["lr"] == pytest.approx(0.01 / focal.fy.item())
+
+
+@pytest.mark.parametrize(("key", "name"), slow_unless(QUICK, [(key, name) for key in LENSES for name in OPTIMIZERS]))
+@pytest.mark.filterwarnings("ignore:.* became unusable")  # SGD may do that
+def test_the_loss_is_good_only_if_the_camera_is(key, name):
+    truth = ct.MODELS[key](LENSES[key][:4], LENSES[key][4:], image_size=(480, 640)).requires_grad_(False)
+    seen = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([639.0, 479.0])
+    points, _ = truth.unproject(seen)
+    camera = type(truth).from_fov(float(truth.fov[0]), image_size=(480, 640))
+    optimizer = OPTIMIZERS[name](camera.parameter_groups(lr=0.5))
+    for _ in range(300):
+        optimizer.zero_grad()
+        ct.losses.reprojection(camera, seen, points, penalty=800).backward()
+        optimizer.step()
+    loss, (pixels, valid) = ct.losses.reprojection(camera, seen, points, penalty=800), camera.project(points)
+    off, lost = (pixels - seen).square().sum(-1).mean().sqrt(), 1 - valid.float().mean()
+    assert (off < 1 and lost == 0) or (name in ("SGD", "momentum") and loss > max(1, 799 * lost))
