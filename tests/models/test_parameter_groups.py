@@ -18,8 +18,7 @@ OPTIMIZERS["momentum"] = lambda groups: torch.optim.SGD(groups, momentum=0.9)
 QUICK = {("kannala_brandt", "AdamW"), ("brown_conrady", "momentum")}.__contains__
 
 
-def most_moved(camera, lr, count=None):
-    """Return by how many pixels a step of one of the first coefficients moves the image at most."""
+def pixels_moved_at_most(camera, lr, count=None):
     rays, seen = camera.unproject(pixel_lattice(camera))
     steps = lr * torch.eye(len(camera.distortion), dtype=torch.float64)[:count]
     after, valid = camera.replace(distortion=camera.distortion + steps).project(rays.expand(len(steps), -1, 3))
@@ -30,13 +29,12 @@ def most_moved(camera, lr, count=None):
 def test_a_step_moves_the_image_by_lr_pixels(key):
     near, camera = rows = spread(key), spread(key)
     near.intrinsics.data[:2] *= 0.8
-    batch = copy.deepcopy(ct.cat(rows))  # with leaves of its own
-    for made, parts in ((camera, [camera]), (batch, rows)):
+    for made, parts in ((camera, [camera]), (copy.deepcopy(ct.cat(rows)), rows)):  # a copy has leaves of its own
         groups = made.parameter_groups(lr=0.01)
         assert [id(*group["params"]) for group in groups] == [id(t) for t in made._tensors if t.requires_grad]
         assert [groups[0]["lr"], *(group["weight_decay"] for group in groups)] == [0.01, *[0] * len(groups)]
         for group in groups[1:]:  # a lens that ends on the image is measured a little inside
-            assert max(most_moved(part, group["lr"]) for part in parts) == pytest.approx(0.01, rel=0.25)
+            assert max(pixels_moved_at_most(part, group["lr"]) for part in parts) == pytest.approx(0.01, rel=0.25)
 
 
 def test_groups_of_what_learns_of_several_cameras():
@@ -46,7 +44,7 @@ def test_groups_of_what_learns_of_several_cameras():
     groups = ct.Mixed([lens.freeze("k3", "k4"), focal, fixed, shared]).parameter_groups(lr=0.01)
     held = [*lens.parameters(), focal.parametrizations.intrinsics.original, shared.intrinsics]
     assert [id(*group["params"]) for group in groups] == [id(t) for t in held]
-    assert most_moved(lens, groups[1]["lr"], 2) == pytest.approx(0.01, rel=0.25)
+    assert pixels_moved_at_most(lens, groups[1]["lr"], 2) == pytest.approx(0.01, rel=0.25)
     assert groups[2]["lr"] == pytest.approx(0.01 / focal.fy.item())
 
 
