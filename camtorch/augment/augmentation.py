@@ -424,7 +424,11 @@ class Augmentation(SampleTransform):
         else:
             change = self.change(camera, self._of_sample(draw, named))
         if change.count != count:
-            raise ValueError(f"{self._name}: draw must be for {count} samples; got one for {change.count}")
+            one = f"{{name: value.expand({count}, *value.shape[1:]) for name, value in draw.items()}} uses it for all"
+            raise ValueError(
+                f"{self._name}: draw must be for {count} samples; got one for {change.count}. draw({count}) makes one "
+                f"for each{f', {one}' if change.count == 1 else ''}"
+            )
         if not torch.compiler.is_compiling():
             self.__dict__["_is_first"] = "rotation" not in named
             self.__dict__["_last"] = change  # as nn.Module would, after some questions

@@ -132,7 +132,9 @@ def calibrate(
         start: A camera to start from, of the model.
         fixed: Names of parameters to hold ("cx", "k3", ...) at the start's values; without a start at zero distortion,
             and the principal point in the middle of the image. "all" finds the poses only.
-        loss: None for least squares; "huber" or "cauchy", of a residual's length, if some corners may be wrong.
+        loss: None for least squares; "cauchy" or "huber", of a residual's length, if some corners may be wrong. With
+            5 % of the corners exchanged, coefficients of "huber" spread by up to 1.6 times what `std` claims, those of
+            "cauchy" as claimed.
         loss_scale: px, the length from which a robust loss grows slower.
         bend: Whether the board may be bent, which adds two unknowns, see `Calibration.bend`.
 

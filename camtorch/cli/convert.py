@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from camtorch.cli import targets
 from camtorch.cli.cameras import read_rig
 from camtorch.cli.terminal import note
 from camtorch.io import formats
+from camtorch.io.record import CameraFileError
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -40,7 +42,7 @@ def run(arguments: argparse.Namespace) -> None:
     # camtorch's own JSON holds every model; the rig's own format may not
     stays = rig.format if arguments.model is None or path.suffix != ".json" else None
     changed = Rig(cameras, None if alone else rig.extrinsics, images=rig.images, format=stays)
-    contents = formats.rendered(changed, path, arguments.format)
+    contents = _rendered(changed, path, arguments.format)
     for name in contents:
         targets.check(Path(name), force=arguments.force, inputs=_read(arguments.input))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,6 +50,20 @@ def run(arguments: argparse.Namespace) -> None:
     print("\n".join(notes))
     if alone and len(rig.extrinsics):
         note(f"{path}: {arguments.name} alone; its pose is left out")
+
+
+def _rendered(rig: Rig, path: Path, format: str | None) -> dict[str, bytes]:
+    """Return the files of a rig; raise a CameraFileError that names the formats which the path may mean as well."""
+    try:
+        return formats.rendered(rig, path, format)
+    except CameraFileError as error:
+        others = []
+        for other in formats.WRITTEN.values() if format is None else ():
+            with contextlib.suppress(ValueError):
+                if path.name.lower().endswith(other.suffixes) and formats.rendered(rig, path, other.format):
+                    others.append(other.format)
+        hint = f". --format {' or '.join(others)} holds it" if others else ""
+        raise ValueError(f"{error}{hint}") from None
 
 
 def _read(path: Path) -> tuple[Path, ...]:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
+from camtorch.evaluate.door import pytree
 from camtorch.io import poses
 from camtorch.io.parsing import plain
 from camtorch.io.record import Names, Record, one_of
@@ -89,6 +90,8 @@ def _camera(record: Record) -> Camera:
     names = [name.text() for name in record["distortion_names"]] if "distortion_names" in record else []
     kind = record["model"].model(key)
     intrinsics = _tensor(record["intrinsics"], 4)
+    if bool((intrinsics[..., :2].abs() < torch.finfo(torch.float32).tiny).any()):  # which float32 takes for zero
+        record["intrinsics"].fail(f"focal lengths must be positive; got {record['intrinsics'].value!r:.60}")
     if names and list(kind.names_of(len(names)) or ()) != names:
         record["distortion_names"].fail(f"must be names of {kind.__name__}, {kind.counts_text()}; got {names!r:.60}")
     distortion = _tensor(record["distortion"], len(names)) if names or "distortion" in record else intrinsics[..., :0]
@@ -111,6 +114,8 @@ def _same_batch(record: Record, *tensors: Tensor) -> None:
 
 def _tensor(record: Record, last: int) -> Tensor:
     """Return a record's numbers, float64 (*B, last); any last dim is accepted if `last` is 0."""
+    if any(isinstance(number, bool) for number in pytree.tree_leaves(record.value)):
+        record.fail(f"must be numbers; got {record.value!r:.60}")
     try:
         values = torch.tensor(record.value, dtype=torch.float64)
     except (ValueError, TypeError, RuntimeError) as error:

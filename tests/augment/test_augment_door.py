@@ -88,7 +88,11 @@ def test_cameras_and_draws(camera):
         (lambda: mount(given | {"camera": {}}), "camera must be a Camera; got dict"),
         (lambda: mount(given | {"camera": camera.expand(3)}), r"no batch dims, or those of 2 samples; got \(3,\)"),
         (lambda: mount(given | {"camera": [camera]}), "camera must have one for each of 2 samples; got 1"),
-        (lambda: mount(given, draw=mount.draw(3)), "draw must be for 2 samples; got one for 3"),
+        (lambda: mount(given, draw=mount.draw(3)), r"for 2 samples; got one for 3\. draw\(2\) makes one for each$"),
+        (
+            lambda: mount(given, draw=mount.draw(1)),
+            r"got one for 1\. draw\(2\) makes .*, \{name: value.expand\(2, .* for all",
+        ),
         (lambda: mount(given, draw=some), "draw must have yaw, pitch, roll, zoom; got apply"),
         (lambda: mount(given, draw={**draw, "yaw": draw["yaw"][:, None]}), r"\['yaw'\] must be \(2,\); .* \(2, 1\)"),
         (lambda: RandomMount().inverse(given), "must have a change to invert; got none. Call it first"),

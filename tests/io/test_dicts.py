@@ -66,6 +66,14 @@ def changed(**values):
             lambda: ct.Camera.from_dict({"model": "kannala_brandt", "intrinsics": [3, 3, 2, 2], "distortion": []}),
             "distortion: must have coefficients n >= 1 .* got 0",
         ),
+        (
+            lambda: ct.Camera.from_dict(changed(distortion=[0.1, True, 0.0, 0.0])),
+            r"distortion: must be numbers; got .*True.*",
+        ),
+        (
+            lambda: ct.Camera.from_dict(changed(intrinsics=[1e-320, 3, 2, 2])),
+            r"intrinsics: focal lengths must be positive; .*",
+        ),
         (lambda: ct.Camera.from_dict(changed(image_size=[4.5, 6])), r"image_size\[0\]: must be a number of pix.*"),
         (lambda: ct.Pinhole.from_dict(changed()), "model: must be of Pinhole; got KannalaBrandt.*"),
         (lambda: ct.Extrinsics.from_dict({"rotation": [0, 0, 1]}), "translation: must be given; got keys 'rotation'"),
