@@ -46,7 +46,7 @@ from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free, in_worker, is_unknown
 from camtorch.models import Pinhole
-from camtorch.native.library import tell_if_missing
+from camtorch.native.library import warn_if_missing
 from camtorch.values.arguments import (
     CLOSE,
     GUESS_CAMERA,
@@ -385,7 +385,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         check_devices(self._name, **held)
         device, camera = next((v.device for v in held.values()), torch.device("cpu")), alone(as_one(camera))
         if device.type == "cpu" and are_free():
-            tell_if_missing()
+            warn_if_missing()
         if camera.intrinsics.device != device:
             own, camera = camera, camera.each(lambda t: t.to(device))
             if own.intrinsics.is_cpu and not is_unknown(own.intrinsics):

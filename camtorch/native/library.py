@@ -50,7 +50,7 @@ def library() -> ctypes.CDLL | None:
     return _find()[0]
 
 
-def tell_if_missing() -> None:
+def warn_if_missing() -> None:
     """Warn, once a process, that long work is done without the library, unless CAMTORCH_NATIVE=0 says so.
 
     Of a DataLoader's workers the first one warns.

@@ -16,7 +16,7 @@ from camtorch.evaluate.door import is_native, way_of
 from camtorch.evaluate.export import portable_export, with_values
 from camtorch.evaluate.kept import Kept, same
 from camtorch.evaluate.known import are_free
-from camtorch.native.library import tell_if_missing
+from camtorch.native.library import warn_if_missing
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.rows import CameraRows, Direction, unusable
 from camtorch.values.arguments import Numbers, as_points, warn
@@ -79,7 +79,7 @@ def evaluate_rows(
         planes, valid, *_ = direction.native(made, rows.detach())
         return planes, valid
     if way.is_native and rows.shape[0] * rows.shape[1] >= _MANY:
-        tell_if_missing()
+        warn_if_missing()
     return direction.formula(type(camera), *inputs, known, way.order)
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from camtorch.evaluate.door import converted, in_transform, is_eager, may_look
 from camtorch.evaluate.known import are_known, are_plain
 from camtorch.native import sampler
-from camtorch.native.library import native_available, tell_if_missing
+from camtorch.native.library import native_available, warn_if_missing
 from camtorch.values.arguments import as_flag, as_number, one_of, shown
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, wide_dtype, widen
 from camtorch.values.threads import thread_count
@@ -79,7 +79,7 @@ def prepared(images: Tensor, where: Sampling | Lattice, how: Sampler, out: Tenso
     if not is_eager(images, positions):
         return None
     if not (native_available() and sampler.takes(images.dtype, mode)):
-        tell_if_missing()
+        warn_if_missing()
         return None
     if images.requires_grad or (positions.requires_grad and images.dtype.is_floating_point):
         return None
