@@ -38,6 +38,13 @@ _SIZE_LIKE = 32  # px; two whole coefficients from here on are an image size
 _LOOKED_AT = 64  # cameras of a batch that are checked: a wrong order is in all of them
 _CENTRED, _NEAR = 0.1, 0.05
 """Parts of the image's sides: how far from its middle most principal points lie, and how near one lies on purpose."""
+_FAR = 0.14  # both parts, to one side: the images of the calibration were larger or smaller
+_SIZES = """
+224x224 256x256 240x320 270x480 360x480 360x640 400x640 480x640 480x752 512x512 540x960 576x720 600x800 600x960
+720x1280 768x1024 800x1280 960x1280 1024x1024 1024x1280 1080x1440 1080x1920 1200x1600 1200x1920 1440x1920 1440x2560
+1536x2048 1944x2592 2160x3840 2448x3264 3000x4000 3024x4032
+"""  # of cameras
+_CUT_OUT = "For a part of an image use camera.crop"
 
 
 def checked_numbers(
@@ -55,7 +62,9 @@ def checked_numbers(
     batch = as_batch(owner, intrinsics=intrinsics.shape, distortion=distortion.shape)
     size = as_image_size(image_size, owner)
     if size is not None:
-        warn_of_order(intrinsics, size, owner)
+        rows = off_centre(intrinsics, size)
+        warn_of_order(rows, size, owner)
+        warn_of_size(rows, size, owner)
     return intrinsics, distortion, model.names_of(distortion.shape[-1]) or (), batch, size
 
 
@@ -159,8 +168,10 @@ def replaced(
     batch = as_batch(model.__name__, intrinsics=now.shape, distortion=k.shape)
     check_devices(model.__name__, intrinsics=now, distortion=k)
     size = changes.get("image_size", camera.image_size)
-    if intrinsics is not None and size is not None:
-        warn_of_order(now, size, model.__name__)
+    if size is not None and intrinsics is not None:
+        warn_of_order(off_centre(now, size), size, model.__name__)
+    elif size is not None and camera.image_size is None and now.is_cpu and now.grad_fn is None:  # as of a file's K
+        warn_of_size(off_centre(now.detach(), size), size, model.__name__)
     for name in changes.keys() & {"intrinsics", "distortion"}:
         value = changes[name]
         if not is_kept(value):
@@ -287,27 +298,34 @@ def camera_of_fov(
     return made
 
 
-def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str, order: str = "(height, width)") -> None:
-    """Warn of plain numbers (*B, 4) that fit in another order only: sides exchanged, or as fx, cx, fy, cy.
+Rows = list[list[float]]  # fx, fy, cx, cy of each camera
 
-    order: how the sides were given.
-    """
+
+def off_centre(intrinsics: Tensor, size: tuple[int, int]) -> Rows:
+    """Return the rows of plain numbers (*B, 4); none if a principal point is near the middle of images of `size`."""
     if is_kept(intrinsics) or is_predicted(intrinsics):
-        return
+        return []
     row = row_of(intrinsics)
     known = values_of(intrinsics) if row is None else None
     rows = [row] if row is not None else [] if known is None else known.reshape(-1, 4)[:_LOOKED_AT].tolist()
-    if not rows or any(_off_centre(cx, cy, size) <= _CENTRED for _, _, cx, cy in rows):
+    return [] if any(_off_centre(cx, cy, size) <= _CENTRED for _, _, cx, cy in rows) else rows
+
+
+def warn_of_order(rows: Rows, size: tuple[int, int], owner: str, order: str = "(height, width)") -> None:
+    """Warn of rows `off_centre` that fit in another order only: sides exchanged, or as fx, cx, fy, cy.
+
+    order: how the sides were given.
+    """
+    if not rows:
         return
     given = f"fx, fy, cx, cy = {rows[0]}"
     is_file = order == "(width, height)"
     sides = size[::-1] if is_file else size
     how = "Write image_width and image_height" if is_file else "Exchange OpenCV's (width, height)"
-    cut_out = "For a part of an image use camera.crop"
     if all(_off_centre(cx, cy, size[::-1]) <= _NEAR for _, _, cx, cy in rows):
         warn(
             f"{owner}: image_size={sides} is taken as {order}, but the principal point of {given} is the "
-            f"middle of {sides[::-1]}. {how}. {cut_out}"
+            f"middle of {sides[::-1]}. {how}. {_CUT_OUT}"
         )
     elif all(
         _off_centre(fy, cy, size) <= _NEAR and abs(cx - fx) <= _NEAR * fx and abs(fy - fx) > _CENTRED * fx
@@ -315,13 +333,33 @@ def warn_of_order(intrinsics: Tensor, size: tuple[int, int], owner: str, order: 
     ):
         warn(
             f"{owner}: {given} have their principal point far from the middle of images of {size}, and seem to be "
-            f"fx, cx, fy, cy. Pass both focal lengths first. {cut_out}"
+            f"fx, cx, fy, cy. Pass both focal lengths first. {_CUT_OUT}"
         )
     elif all(20 * max(fx, fy) < min(size) and max(abs(cx - 0.5), abs(cy - 0.5)) < 0.2 for fx, fy, cx, cy in rows):
         warn(
             f"{owner}: {given} seem to be parts of the image's width and height. Multiply fx and cx by the width, "
             "fy and cy by the height, and subtract 0.5 from cx and cy"
         )
+
+
+def warn_of_size(rows: Rows, size: tuple[int, int], owner: str) -> None:
+    """Warn of rows `off_centre` that seem to be of larger or of smaller images than those of `size`."""
+    offs = [((cx + 0.5) / size[1] - 0.5, (cy + 0.5) / size[0] - 0.5) for _, _, cx, cy in rows]
+    is_far = all(min(off) > _FAR for off in offs) or all(max(off) < -_FAR for off in offs)
+    if rows and is_far and min(its := _size_about(*rows[0][2:])) >= _SIZE_LIKE:
+        warn(
+            f"{owner}: fx, fy, cx, cy = {rows[0]} have their principal point far from the middle of images of {size}, "
+            f"and seem to be of images of about (height, width) = {its}. Pass image_size={its}, then scale that camera "
+            f"by .resize{size}. {_CUT_OUT}"
+        )
+
+
+def _size_about(cx: float, cy: float) -> tuple[int, int]:
+    """Return the (height, width) whose middle is at a point: a common size that is near, else multiples of 16."""
+    sides = [tuple(map(int, text.split("x"))) for text in _SIZES.split()]
+    both = [pair for a, b in sides for pair in ((a, b), (b, a))]
+    near = min(both, key=lambda size: _off_centre(cx, cy, size))
+    return near if _off_centre(cx, cy, near) < _NEAR / 2 else (16 * round(cy / 8), 16 * round(cx / 8))
 
 
 def warn_of_exchange(old: tuple[int, int], new: tuple[int, int], owner: str, how: str = "stretched") -> None:

@@ -11,6 +11,7 @@ from camtorch.cameras.rig import Rig
 from camtorch.io.record import Names, Record, one_of
 from camtorch.models import FTheta, FThetaBackward
 from camtorch.values.arguments import LEFT
+from camtorch.values.module import remade
 
 NAMES = Names("ncore", "ncore")
 
@@ -50,7 +51,7 @@ def _f_theta(values: Record) -> Camera:
     centre, size = np.array(values["principal_point"].numbers(2)), values["resolution"].size()
     linear = linear if any(linear) else [1.0, 0.0, 0.0]  # ncore reads zeros as the identity
     try:
-        return kind.from_polynomial(centre, np.array(rest), linear_cde=linear, image_size=size)
+        return remade(kind.from_polynomial(centre, np.array(rest), linear_cde=linear), image_size=size)
     except ValueError as error:
         return coefficients.fail(error)
 

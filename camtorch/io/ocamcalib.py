@@ -12,6 +12,7 @@ from camtorch.io import poses
 from camtorch.io.parsing import decoded
 from camtorch.io.record import CameraFileError, Names, Record
 from camtorch.models import OCamCalib
+from camtorch.values.module import remade
 
 NAMES = Names("ocamcalib", "OCamCalib")
 
@@ -49,6 +50,7 @@ def read(path: str, content: bytes) -> Rig:
     height, width = (side.side() for side in size)
     values = polynomial.numbers()[1:], centre.numbers(2), affine.numbers(3)
     try:
-        return Rig({"camera": OCamCalib.from_ocamcalib(*map(poses.as_float64, values), image_size=(height, width))})
+        camera = OCamCalib.from_ocamcalib(*map(poses.as_float64, values))
+        return Rig({"camera": remade(camera, image_size=(height, width))})
     except (ValueError, TypeError) as error:
         return record.fail(error)

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import torch
 
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.numbers import warn_of_order
+from camtorch.cameras.numbers import off_centre, warn_of_order, warn_of_size
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.parsing import parse_mapping, read_bytes
@@ -137,7 +137,10 @@ class _File:
             self.fail(place, f"the model must be the file's, {stated[0]}; got {model}. Leave it out or change the file")
         kind, size = model or ("mei" if xi else self.model(distortion, stated)), self.image_size()
         if size is not None and self.find(_SIZE):  # a pair of numbers, whose order no key states
-            warn_of_order(torch.tensor(intrinsics), size, str(self.record.path), "(width, height)")
+            rows = off_centre(torch.tensor(intrinsics), size)
+            warn_of_order(rows, size, str(self.record.path), "(width, height)")
+            if self.record.path == "loads":  # keys that the caller has put together
+                warn_of_size(rows, size, "loads")
         return self.record[key].camera(kind, intrinsics, distortion, size, self.record[lens or xi or key])
 
     def stated(self) -> tuple[tuple[str, ...], str | None]:

@@ -141,7 +141,7 @@ def cut(
     numbers = [torch.cat((focal * SIDE / side, (centre - middle) * SIDE / side + (pixels_wide - 1) / 2), -1)]
     if camera.distortion_names:
         numbers.append(camera.distortion.expand(len(pixels), -1))
-    return type(camera)(*numbers, image_size=(pixels_wide, pixels_wide)).requires_grad_(False), whole
+    return camera.replace(*numbers, image_size=(pixels_wide, pixels_wide)).requires_grad_(False), whole
 
 
 def corner_rays(camera: Camera) -> Tensor:

@@ -146,7 +146,7 @@ DRCAL_POSE = [0.010354696, 0.049334616, -0.020189797], [-0.2001096, 0.010078093,
 
 def test_derivatives_give_the_sigmas_of_drcal():
     """As the page of what left says: no point depends on the pixels of another."""
-    cameras = [ct.BrownConrady(*(torch.tensor(v).double() for v in of), image_size=SIZE) for of in DRCAL_PAIR]
+    cameras = [ct.BrownConrady(*(torch.tensor(v).double() for v in of), image_size=(480, 640)) for of in DRCAL_PAIR]
     poses = [ct.Extrinsics(*pose).double() for pose in (([0.0] * 3, [0.0] * 3), DRCAL_POSE)]
     points = torch.tensor([[0.05, 0.02, 0.8], [-0.2, 0.1, 2], [0.3, 0.2, 5], [0, 0, 10], [0.1, 0.1, 30]]).double()
     pixels = torch.stack([c.project(e(points))[0] for c, e in zip(cameras, poses, strict=True)]).detach()

@@ -315,6 +315,40 @@ def test_a_size_and_numbers_in_another_order_are_told(as_passed):
     ct.Pinhole(as_passed([1.0, 1.0, 0.5, 0.5]), image_size=(4, 4))
 
 
+@as_passed
+def test_numbers_of_images_of_another_size_are_told_with_it(as_passed):
+    for numbers, size, about in (
+        ([900.0, 900.0, 640.0, 360.0], WIDE, (720, 1280)),
+        ([905.0, 903.0, 655.0, 348.0], (360, 640), (720, 1280)),
+        ([900.0, 900.0, 639.5, 359.5], (1080, 1920), (720, 1280)),
+        ([900.0, 900.0, 360.0, 640.0], (640, 480), (1280, 720)),
+        ([500.0, 500.0, 103.0, 120.0], WIDE, (240, 208)),
+    ):
+        way = re.escape(f"(height, width) = {about}. Pass image_size={about}, then scale that camera by .resize{size}.")
+        with pytest.warns(UserWarning, match=f"BrownConrady: .*seem to be of images of about {way}"):
+            ct.BrownConrady(as_passed(numbers), image_size=size)
+    for numbers in ([900.0, 900.0, 640.0, 300.0], [900.0, 900.0, 400.0, 310.0], [1.0, 1.0, 0.0, 0.0]):
+        ct.BrownConrady(as_passed(numbers), image_size=WIDE)
+
+
+def test_a_matrix_and_a_file_without_a_size_are_told_if_one_does_not_fit(tmp_path):
+    K, crop = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), [500.0, 500.0, 600.0, 470.0]  # noqa: N806
+    np.savez(tmp_path / "K.npz", K=K)
+    rows = torch.tensor([[900.0, 900.0, 640.0, 360.0], [900.0, 900.0, 330.0, 250.0]])
+    for call in (
+        lambda: ct.KannalaBrandt.from_matrix(K, np.zeros((4, 1)), image_size=WIDE),
+        lambda: ct.Pinhole.from_matrix(torch.tensor(K), image_size=WIDE),
+        lambda: ct.load(tmp_path / "K.npz").camera.replace(image_size=WIDE),
+        lambda: ct.loads({"K": K, "image_size": [640, 480]}),
+    ):
+        with pytest.warns(UserWarning, match="then scale that camera by"):
+            call()
+    ct.Pinhole(rows, image_size=WIDE)  # as long as one of them fits
+    made = ct.Pinhole(torch.nn.Parameter(torch.tensor(crop)), image_size=WIDE).requires_grad_(False)
+    ct.Camera.from_dict(made.replace([*crop[:2], 601.0, 471.0]).to_dict())
+    ct.data.from_columns(ct.data.to_columns(made))
+
+
 def test_what_is_off_centre_for_a_reason_is_not_warned_of(tmp_path):
     camera = ct.Pinhole([500.0, 500.0, 319.5, 239.5], image_size=WIDE)
     portrait = camera.crop(0, 0, 640, 480)  # whose centre is where that of the whole image is

@@ -67,7 +67,7 @@ def test_lines_through_one_point_meet():
         for pixel, line in zip(pixels[seen][:4], lines[valid][::97][seen][:4], strict=True):
             # the camera whose top-left pixel is that one
             shifted = second.intrinsics - torch.cat((pixel.new_zeros(2), pixel))
-            one = second.replace(intrinsics=shifted)
+            one = second.replace(intrinsics=torch.nn.Parameter(shifted))
             one.image_size = (1, 1)
             its, valid_there = one.plucker(other)
             if valid_there.item():

@@ -53,7 +53,7 @@ THREE, ONES, ROW = torch.tensor([NUMBERS] * 3), torch.full((3, 1), 0.1), torch.z
 VECTORS, T = [np.full((1, 3), 0.1 * i) for i in range(4)], torch.tensor
 SHAPES = [
     *((lambda model=model: model(THREE, ONES), (3,)) for model in (ct.UCM, ct.FOV, ct.KannalaBrandt)),
-    *((lambda model=model: model(THREE, ONES, image_size=(4, 6)).hflip(), (3,)) for model in (ct.UCM, ct.FOV)),
+    *((lambda model=model: model(THREE, ONES, image_size=(480, 640)).hflip(), (3,)) for model in (ct.UCM, ct.FOV)),
     (lambda: ct.UCM.from_matrix(np.stack([K] * 3), ONES), (3,)),
     (lambda: ct.UCM(NUMBERS, ONES), (3,)),
     (lambda: MATRIX(K, torch.zeros(3, 4)), (3,)),

@@ -252,7 +252,7 @@ CAMERA = camera_of("kannala_brandt")
 def test_numbers_are_replaced_by_those_of_another_order_with_a_warning_and_of_narrow_dtypes():
     with pytest.warns(UserWarning, match="Pass both focal lengths first"):
         CAMERA.replace([50.0, 39.5, 51.0, 29.5])
-    assert CAMERA.replace(CAMERA.intrinsics.detach().half()).intrinsics.dtype == torch.float32
+    assert CAMERA.replace(torch.tensor([50.0, 51.0, 39.5, 29.5]).half()).intrinsics.dtype == torch.float32
     assert CAMERA.replace(distortion=CAMERA.distortion.detach().bfloat16()).distortion.dtype == torch.float32
 
 

@@ -126,7 +126,7 @@ def test_the_door():
     for error, match, *calls in (
         (ValueError, r"must be (a )?single", *(lambda draw=draw: draw(batch, None) for draw in ON_AXES)),
         (ValueError, "image_size must be", lambda: plot.distortion_field(ct.Pinhole([1.0, 1, 0, 0]))),
-        (ValueError, "must be of one size", lambda: plot.difference(fisheye(), fisheye(image_size=(10, 10)))),
+        (ValueError, "must be of one size", lambda: plot.difference(fisheye(), fisheye(image_size=(482, 640)))),
         (ValueError, "as many as cameras, 1; got 2", lambda: plot.radius_curve(fisheye(), labels=["a", "b"])),
         (TypeError, "Axes.*; got KannalaBrandt. Pass several cameras", lambda: plot.radius_curve(fisheye(), fisheye())),
     ):
