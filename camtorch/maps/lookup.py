@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch.values.dtypes import narrow, widen
+from camtorch.values.dtypes import check_averaged, narrow, widen
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.grid import OUTSIDE
 from camtorch.warp.warp import Warp
@@ -108,11 +108,11 @@ class LookupMap:
     def __call__(self, images: Image, mode: str = "bilinear", padding_mode: str = "zeros") -> Image:
         """Warp images of the source's size, and return the same kind, as `Warp` does; dtypes are kept.
 
-        Integers are exact up to 2^53.
-        `mode` is "nearest", "bilinear" or "bicubic", `padding_mode` "zeros", "border" or "reflection".
+        `mode` is "nearest", of which integers are exact up to 2^53, "bilinear" or "bicubic"; `padding_mode` is "zeros",
+        "border" or "reflection".
 
         Raises:
-            ValueError: If the images have another shape or size.
+            ValueError: If the images have another shape or size, or integers but uint8 and uint16 would be averaged.
         """
         size, given = self.source_size, cast("Any", images)
         if not isinstance(given, Tensor):
@@ -121,6 +121,7 @@ class LookupMap:
         if given.is_complex() or given.is_sparse or given.ndim < 3 or given.shape[-2:] != size:
             what, form = f"{given.dtype} {tuple(given.shape)}", f"(..., C, {size[0]}, {size[1]})"
             raise ValueError(f"LookupMap: images must be a dense tensor {form} of real numbers; got {what}")
+        check_averaged(given, mode, "images", "LookupMap")
         values = widen(given[None].flatten(0, -4))
         grid = self.grid().to(values).expand(len(values), -1, -1, -1)
         made = narrow(F.grid_sample(values, grid, mode, padding_mode, align_corners=False), given.dtype)

@@ -12,6 +12,19 @@ SIGNED = {torch.uint16: torch.int16, torch.uint32: torch.int32, torch.uint64: to
 """The dtypes of the same bits that torch can flip and gather: it cannot do so for unsigned ones of more than a byte."""
 
 
+_AVERAGED = torch.bool, torch.uint8, torch.uint16
+
+
+def check_averaged(images: Tensor, mode: str, name: str, owner: str) -> None:
+    """Raise a ValueError for integers that are mostly labels, which a `mode` but "nearest" would average."""
+    if mode != "nearest" and not images.dtype.is_floating_point and images.dtype not in _AVERAGED:
+        raise ValueError(
+            f"{owner}: {name} must be of floating point, uint8, uint16 or bool for mode={mode!r}, which averages; got "
+            f"{images.dtype}. Labels keep their values by mode='nearest'; numbers go in as {name}.float(), of an array "
+            f"{name}.astype('float32')"
+        )
+
+
 def wide_dtype(dtype: torch.dtype) -> torch.dtype:
     """Return the dtype to compute images in: every value up to 2^53 is exact in it, class ids too."""
     if dtype.is_floating_point:

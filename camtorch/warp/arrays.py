@@ -95,8 +95,9 @@ def as_planes_of(
         raise TypeError(f"{owner}: {name} must be {forms}; got {type(image).__name__}. {how}")
     if mode in ("1", "P", "PA"):
         raise ValueError(
-            f"{owner}: {name} must be an image whose values can be averaged; got a PIL image of mode {mode!r}. "
-            "image.convert('RGB') makes one, np.asarray(image) or tv_tensors.Mask(image) makes labels of it"
+            f"{owner}: {name} must be an image whose values can be averaged; got a PIL image of mode {mode!r}. Labels "
+            "go in as np.asarray(image) with mode='nearest', in a sample as its mask or tv_tensors.Mask(image); "
+            "image.convert('RGB') makes colours of it"
         )
     array = image if mode is None else np.asarray(image)
 

@@ -14,6 +14,7 @@ from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, turn
 from camtorch.rays.depth import as_depth, depth_scale
 from camtorch.values.arguments import Numbers, check_devices, one_of, shown
+from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.panorama import off_poles, seam_of
@@ -99,6 +100,7 @@ class Reproject(GeometryModule):
         if not isinstance(images, Tensor) or images.ndim != 4 or tuple(images.shape[-2:]) != size:
             raise ValueError(f"{owner}: images must be a tensor (B, C, *image_size) of {size}; got {shown(images)}")
         check_devices(owner, images=images, source=self.source.intrinsics)
+        check_averaged(images, self.mode, "images", owner)
         given = as_depth(depth, kind, self.target._size_for(owner), owner, self.target.intrinsics.device)
         given = given if given.ndim == 4 else given[None, None]
         counts = {"images": len(images), "depth": len(given), "cameras": self.batch_shape.numel()}

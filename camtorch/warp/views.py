@@ -25,7 +25,7 @@ from camtorch.values.arguments import (
     hinting,
     shown,
 )
-from camtorch.values.dtypes import narrow, widen
+from camtorch.values.dtypes import check_averaged, narrow, widen
 from camtorch.values.module import GeometryModule, remade, typed_as
 from camtorch.warp.boxes import corners_of
 from camtorch.warp.sampling import Mode
@@ -119,6 +119,7 @@ class Views(GeometryModule):
             raise ValueError(
                 f"Views: views must be a tensor (..., {len(self)}, C, {size[0]}, {size[1]}); got {shown(views)}"
             )
+        check_averaged(views, self.mode, "views", "Views")
         weights = self.weights()[:, None]
         valid = weights.sum(0) > 0
         valid = valid if views.ndim == 4 else valid[None]

@@ -23,6 +23,7 @@ from camtorch.values.arguments import (
     no_camera,
     one_of,
 )
+from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import typed_as
 from camtorch.warp import plan
 from camtorch.warp.arrays import Image, warped_alike
@@ -140,8 +141,9 @@ class Warp(CameraPair):
 
         Args:
             images: a tensor (..., C, H, W) of the source's image_size: an image, a batch, or clips (B, T, C, H, W). Or
-                an array (H, W), (H, W, C) or (N, H, W, C), or a PIL image. Floating point, integer or bool. With
-                several cameras a tensor needs its batch dim; the camera of a clip serves all its frames.
+                an array (H, W), (H, W, C) or (N, H, W, C), or a PIL image. Floating point, uint8, uint16 or bool;
+                labels, also of uint8, need mode="nearest", which takes any real dtype. With several cameras a tensor
+                needs its batch dim; the camera of a clip serves all its frames.
             mode: overrides the warp's own, for example "nearest" for a mask.
             padding_mode: overrides the warp's own.
             fill: overrides the warp's own.
@@ -154,7 +156,7 @@ class Warp(CameraPair):
 
         Raises:
             ValueError: If the shape or the size is wrong, channels come last in a tensor or first in an array, the
-                colours of a PIL image are a palette's, or several come of one.
+                colours of a PIL image are a palette's, several come of one, or other integers would be averaged.
             TypeError: If images are none of these kinds, or complex.
         """
         call: Any = plan.ready(self, images, mode, padding_mode) if fill is None else None
@@ -359,8 +361,10 @@ def checked(
     values = warp.fill if fill is None else as_fill(fill, "Warp")
     if len(values) not in (1, shape[-3]):
         raise ValueError(f"Warp: fill must have 1 value or {shape[-3]}, one for each channel; got {len(values)}")
+    mode = warp.mode if mode is None else one_of(mode, MODES, "mode", "Warp")
+    check_averaged(images, mode, "images", "Warp")
     return Sampler(
-        warp.mode if mode is None else one_of(mode, MODES, "mode", "Warp"),
+        mode,
         warp.padding_mode if padding_mode is None else one_of(padding_mode, PADDINGS, "padding_mode", "Warp"),
         values,
     )

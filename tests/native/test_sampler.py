@@ -435,7 +435,7 @@ def test_transforms_and_derivatives_take_their_own_way(warp):
 def test_fills_of_any_size(fill):
     for warp in warps():
         for dtype in (torch.uint8, torch.int64, torch.float32, torch.float16, torch.bool):
-            for mode in ("nearest", "bilinear"):
+            for mode in ("nearest", "bilinear")[: 1 if dtype == torch.int64 else 2]:
                 assert warp(torch.zeros(1, 1, 120, 160, dtype=dtype), fill=fill, mode=mode).dtype == dtype
 
 

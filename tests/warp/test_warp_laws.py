@@ -175,7 +175,7 @@ def test_it_is_copied_and_mapped(kind):
         torch.testing.assert_close(mapped, expected, rtol=0, atol=2e-4)
 
 
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.int32, torch.float16, torch.float32])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.uint16, torch.float16, torch.float32])
 @pytest.mark.parametrize("kind", KINDS)
 def test_images_keep_their_dtype_and_integers_have_no_graph(kind, dtype):
     learning = KINDS[kind][0](numbers(kind)).requires_grad_(True)
