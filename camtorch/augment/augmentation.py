@@ -13,7 +13,7 @@ from typing_extensions import Unpack
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds, check_sizes
 from camtorch.augment.elsewhere import Elsewhere, remember_camera, twin_of
 from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.kinds import FRONT_ENDS, Named
+from camtorch.augment.kinds import BOXES, FRONT_ENDS, Named, as_corners
 from camtorch.augment.ranges import Range, Spans, draw
 from camtorch.augment.sample import Batch, Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
@@ -56,8 +56,9 @@ class Augmentation(SampleTransform):
     * `image` (B, C, H, W). `mask` (B, C, H, W) or (B, H, W) of any dtype takes the nearest value. So do `depth` along z
       and `distance` along the ray.
     * `keypoints` (B, N, 2), of several faces (B, F, N, 2), or OpenCV's (B, N, 1, 2); `polygons` (B, M, K, 2); `boxes`
-      (B, M, 4) as x1 y1 x2 y2; all in pixels. Count and order stay. `keypoints_valid` and so on come out as bool: the
-      point lies on the new image, and was valid before. A box with x2 < x1 or y2 < y1 is invalid.
+      (B, M, 4) as x1 y1 x2 y2, `boxes_xywh` as x y width height, `boxes_cxcywh` as x y of the centre, width, height;
+      all in pixels. Count and order stay. `keypoints_valid` and so on come out as bool: the point lies on the new
+      image, and was valid before. A box with x2 < x1 or y2 < y1, or a negative side, is invalid.
     * `points` (B, *N, 3) of the camera frame. `landmarks` are keypoints or points, by their last dim.
     * `gaze`, `directions` (B, *N, 3) turn by R. `pitch_yaw` (B, *N, 2) is a gaze in the angles of ETH-XGaze.
     * `head_pose`, `pose` (B, 4, 4), camera from head; or `rvec` (B, 3) and `tvec` (B, 3) of OpenCV.
@@ -68,8 +69,8 @@ class Augmentation(SampleTransform):
     the camera is one for all or (B,). `BoxCrop` looks at the box of the first frame.
 
     `rotation` (B, 3, 3) comes out: `ray_after = R ray_before`, over all augmentations that the sample went through.
-    Other fields stay as they are. An unknown name that holds numbers which might be geometry, also in a dict in the
-    sample, raises an error; `fields` gives its kind.
+    Other fields stay as they are. `.eval()` changes nothing: call an augmentation in training only. An unknown name
+    that holds numbers which might be geometry, also in a dict in the sample, raises an error; `fields` gives its kind.
 
     Turning the camera and changing its lens move all of it exactly. Moving the camera elsewhere shifts near things
     against far ones, which takes depth: `RandomMount(shift=...)` does it for samples that have some.
@@ -480,8 +481,10 @@ class Augmentation(SampleTransform):
         """Add to a draw the boxes that it needs of a sample: those named `boxes`, or the first of that kind."""
         if not self.crops:
             return draw
-        found: dict[str, Any] = {name: value for name, (kind, value) in named.items() if kind == "boxes"}
-        boxes: Any = found.get("boxes", next(iter(found.values()), None))
+        found: dict[str, Any] = {name: pair for name, pair in named.items() if pair[0] in BOXES}
+        kind, boxes = found.get("boxes", next(iter(found.values()), ("boxes", None)))
+        if kind != "boxes":
+            boxes = [as_corners(kind, b) for b in boxes] if isinstance(boxes, list) else as_corners(kind, boxes)
         return self.with_boxes(draw, boxes.flatten(0, -3)[:1] if getattr(boxes, "ndim", 0) > 3 else boxes)
 
     if TYPE_CHECKING:

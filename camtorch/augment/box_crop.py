@@ -20,7 +20,7 @@ class BoxCrop(Augmentation):
     """An augmentation that crops a box of the sample by a pinhole camera that looks at it, as `ct.views.look_at`.
 
     Landmarks, other boxes, masks, depth, gaze, head pose and the camera move too, and `inverse` moves them back. A draw
-    holds the boxes as `draw["box"]` (B, 4), which `forward` takes from the sample's `boxes`; for `change`, and for the
+    holds the boxes as `draw["box"]` (B, 4), which `forward` takes from the sample's boxes; for `change`, and for the
     first of several calls of a replay, put them there. In a `Compose` the box moves with the parts before. If it left
     the image, the crop shows the middle of the image, and the labels are invalid.
 

@@ -409,15 +409,22 @@ class Change:
 
         return self.each(pixels, lambda part, rows: part.warp.transform_points(rows), stay)
 
-    def boxes(self, boxes: Tensor) -> tuple[Tensor, Tensor]:
-        """Move boxes (count, *N, 4) of x1, y1, x2, y2, and return valid (count, *N)."""
+    def boxes(
+        self, boxes: Tensor, read: Callable[[Tensor], Tensor] = _same, write: Callable[[Tensor], Tensor] = _same
+    ) -> tuple[Tensor, Tensor]:
+        """Move boxes (count, *N, 4) of x1, y1, x2, y2, or of a form that is read and written, and return valid."""
+
+        def move(part: Part, rows: Tensor) -> tuple[Tensor, Tensor]:
+            moved, valid = part.warp.transform_boxes(read(rows))
+            return write(moved), valid
 
         def stay(camera: Camera, rows: Tensor) -> tuple[Tensor, Tensor]:
+            corners = read(rows)
             limits = rows.new_tensor((camera.width, camera.height)) - 0.5
-            on_image = (rows[..., :2] <= limits).all(-1) & (rows[..., 2:] >= -0.5).all(-1)
-            return rows, on_image & in_order(rows) & torch.isfinite(rows).all(-1)
+            on_image = (corners[..., :2] <= limits).all(-1) & (corners[..., 2:] >= -0.5).all(-1)
+            return rows, on_image & in_order(corners) & torch.isfinite(corners).all(-1)
 
-        return self.each(boxes, lambda part, rows: part.warp.transform_boxes(rows), stay)
+        return self.each(boxes, move, stay)
 
     def quadrilaterals(self, corners: Tensor) -> tuple[Tensor, Tensor]:
         """Move quadrilaterals (count, *N, 4, 2) to corners of enclosing boxes, and return valid (count, *N)."""

@@ -6,7 +6,7 @@ import copy
 import difflib
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,10 +16,11 @@ from torch import Tensor
 
 from camtorch.augment.change import Change, Drawn
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.door import pytree
+from camtorch.evaluate.door import may_look, pytree
 from camtorch.evaluate.known import are_free, are_numbers, known_false, known_true
 from camtorch.poses.rotations import are_rotations, check_rotation, is_right, rotation_matrix, rotation_vector
 from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians, warn
+from camtorch.values.dtypes import widen
 from camtorch.values.threads import thread_count
 from camtorch.warp import arrays
 from camtorch.warp.plan import Label, SampleCall, call_for
@@ -104,6 +105,32 @@ def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tup
     return change.points(pixels)
 
 
+_PLACED = {"boxes_xywh": 0.0, "boxes_cxcywh": 0.5}
+"""Kinds of boxes by place, width and height: how far along their sides the place is."""
+
+
+def as_corners(kind: str, boxes: Tensor) -> Tensor:
+    """Return boxes (..., 4) of a kind as x1, y1, x2, y2."""
+    if kind not in _PLACED:
+        return boxes
+    place, size = widen(boxes).split(2, -1)
+    low = place - _PLACED[kind] * size
+    return torch.cat((low, low + size), -1)
+
+
+def _sided_boxes(kind: str, form: str) -> Field:
+    """Return the field of boxes by place, width and height."""
+
+    def write(corners: Tensor) -> Tensor:
+        low, high = corners.split(2, -1)
+        return torch.cat((low + _PLACED[kind] * (high - low), high - low), -1)
+
+    def move(change: Change, boxes: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
+        return change.boxes(boxes, functools.partial(as_corners, kind), write)
+
+    return Field(2, 2, (4,), f"(B, M, 4) pixels {form}", move, True)
+
+
 _DIRECTIONS = Field(
     1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", lambda change, rays, _: change.rays(rays)
 )
@@ -119,6 +146,8 @@ KINDS = {
     "keypoints": Field(2, 3, (2,), "(B, N, 2) or (B, F, N, 2) pixels x, y", _pixels, True),
     "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, True),
     "boxes": Field(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", lambda change, boxes, _: change.boxes(boxes), True),
+    "boxes_xywh": _sided_boxes("boxes_xywh", "x, y, width, height"),
+    "boxes_cxcywh": _sided_boxes("boxes_cxcywh", "x and y of the centre, width, height"),
     "landmarks": Field(2, 3, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True),
     "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _positions),
     "gaze": _DIRECTIONS,
@@ -133,7 +162,8 @@ KINDS = {
 _TURNED = "points", "gaze", "directions", "tvec", "landmarks"
 _MATRICES = "head_pose", "pose", "rotation"
 """Kinds whose columns turn."""
-CHECKED = ("boxes", "rvec", "head_pose", "pose", "pitch_yaw")
+BOXES = "boxes", *_PLACED
+CHECKED = (*BOXES, "rvec", "head_pose", "pose", "pitch_yaw")
 """Kinds whose values are checked, in addition to their shape."""
 ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
@@ -144,6 +174,7 @@ _PLACES = {
     **dict.fromkeys(("eye", "pupil", "nose", "mouth", "corner", "center", "centre"), "keypoints"),
 }
 _ANGLES = {"yaw", "pitch", "roll"}
+_OFF = 0.1  # of the image's sides: keypoints so far outside of it are not of it
 _RANKS = {kind: (not field.decides, i) for i, (kind, field) in enumerate(KINDS.items())}
 
 
@@ -162,6 +193,8 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single
     if base is None and isinstance(value, (Tensor, np.ndarray, list, tuple)) and not is_text(value):
         begins = sorted((k for k in KINDS if name.startswith(k + "_")), key=len)  # compilers do not know max with a key
         base = begins[-1] if begins else None
+    if base == "boxes" and (form := f"boxes_{name.rpartition('_')[2]}") in _PLACED:  # as boxes_face_xywh
+        base = form
     if base is None and _may_be_geometry(name, value, single):
         if isinstance(value, Mapping):
             raise ValueError(
@@ -274,7 +307,7 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
                 ". Rotations R (..., 3, 3) go in as torch.nn.functional.pad(R, (0, 1)), with zeros for the place; "
                 "R = ct.head_rotation(angles), of pitch, yaw and roll in radians. OpenCV's go in as rvec=..., tvec=..."
             )
-        if kind in ("boxes", "keypoints", "landmarks") and dims == 1 and value.shape[-1] in field.last:
+        if kind in (*BOXES, "keypoints", "landmarks") and dims == 1 and value.shape[-1] in field.last:
             hint = f". A single one for each sample goes in as {name}[..., None, :]"
             hint += f", those that all samples share as {name}.expand(B, -1, -1)" if batched else ""
         if kind == "image" and value.ndim in (2, 5):
@@ -289,14 +322,20 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
 
 def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
     """Raise a ValueError if plain labels are not in the form of their kind; NaN is accepted."""
-    if kind == "boxes":
-        form = getattr(getattr(value, "format", None), "value", "XYXY")  # of torchvision's BoundingBoxes
-        if form != "XYXY":
+    if kind in BOXES:
+        form = getattr(getattr(value, "format", None), "value", None)  # of torchvision's BoundingBoxes
+        if form not in (None, "XYXY" if kind == "boxes" else kind.removeprefix("boxes_").upper()):
             raise ValueError(
-                f"{owner}: {name} must be x1, y1, x2, y2; got BoundingBoxes of the format {form}. Use "
+                f"{owner}: {name} must be {KINDS[kind].shape}; got BoundingBoxes of the format {form}. Use "
                 "camtorch.augment.torchvision.Transform for them"
             )
-        check_boxes(value, name, owner)
+        if kind == "boxes":
+            check_boxes(value, name, owner)
+        elif not value.requires_grad and known_true((negative := (value[..., 2:] < 0).any(-1)).any()):
+            raise ValueError(
+                f"{owner}: {name} must be {KINDS[kind].shape}, with sides of 0 or more; got "
+                f"{value[negative][0].tolist()}. Boxes x1, y1, x2, y2 are of the kind 'boxes'"
+            )
     elif kind == "rvec":
         check_radians(value, name, owner)
     elif kind in ("head_pose", "pose") and value.is_cpu and not value.requires_grad:
@@ -317,12 +356,21 @@ def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
             )
 
 
-def warn_of_numbers(kind: str, name: str, value: Tensor, has_flags: bool, owner: str) -> None:
-    """Warn of labels that seem to be parts of an image's sides, as some detectors give them, or to mean "not seen"."""
-    if kind not in ("boxes", "keypoints", "landmarks") or not value.is_cpu:
+def warn_of_numbers(kind: str, name: str, value: Tensor, flags: Any, size: Sequence[int], owner: str) -> None:
+    """Warn of labels that seem to be parts of an image's sides, of an image of another `size`, or to mean "not seen".
+
+    flags: those given of points that are valid, or None.
+    """
+    if kind not in (*BOXES, "keypoints", "landmarks") or not value.is_cpu:
         return
-    pixels = value if kind == "boxes" else value[..., :2]
-    if value.shape[-1] == 2 and not has_flags and known_true((pixels == -1).all(-1).any()):
+    pixels = value if kind in BOXES else value[..., :2]
+    if value.shape[-1] == 2 and _are_off(value, flags, size):
+        warn(
+            f"{owner}: {name} must be pixels of the image, of (height, width) = {tuple(size)}; got most of them far "
+            "outside of it, as of an image of another size. Scale x by (x + 0.5) * width / old width - 0.5, and so y. "
+            f"For points that are not seen pass NaN, or {name}_valid=..., a flag for each"
+        )
+    if value.shape[-1] == 2 and flags is None and known_true((pixels == -1).all(-1).any()):
         warn(
             f"{owner}: {name} has points at (-1, -1), which move as any pixels. If these are not seen, pass NaN, or "
             f"{name}_valid=..., a flag for each"
@@ -330,16 +378,32 @@ def warn_of_numbers(kind: str, name: str, value: Tensor, has_flags: bool, owner:
     if value.numel() <= 3 or not known_true((pixels == pixels.clamp(0, 1)).all() & (pixels % 1 != 0).any()):
         return
     if value.shape[-1] != 3:
-        corners = " x1, y1, x2, y2" if kind == "boxes" else ""
+        form = KINDS[kind].shape.partition(") ")[2] if kind in BOXES else "pixels"
+        places = " from x and y" if kind in _PLACED else ""
         warn(
-            f"{owner}: {name} must be pixels{corners}; got values within [0, 1], as parts of an image's sides. "
-            "Multiply them by width and height, and subtract 0.5"
+            f"{owner}: {name} must be {form}; got values within [0, 1], as parts of an image's sides. Multiply them by "
+            f"width and height, and subtract 0.5{places}"
         )
     elif known_true((value[..., 2] <= 0).any()):
         warn(
             f"{owner}: {name} must be points of the camera frame, in front of it; got x and y within [0, 1] and z of 0 "
             f"or less, as a detector's. Pass pixels, {name}[..., :2] times width and height, less 0.5"
         )
+
+
+def _are_off(points: Tensor, flags: Any, size: Sequence[int]) -> bool:
+    """Whether most points (..., 2), of those that are seen, are off the image by more than a tenth of its sides."""
+    if not points.numel() or not may_look(points):
+        return False
+    places, sides = points.detach().reshape(-1, 2), (size[1], size[0])
+    ends = zip(places.amin(0).tolist(), places.amax(0).tolist(), sides, strict=True)
+    if all(-_OFF * side < low and high < (1 + _OFF) * side - 1 for low, high, side in ends):  # as in most samples
+        return False
+    seen = torch.isfinite(places).all(-1)
+    if flags is not None and (given := torch.as_tensor(flags)).numel() == len(seen):
+        seen = seen & (given.reshape(-1) != 0)
+    off = ((places + 0.5) / places.new_tensor(sides) - 0.5).abs().amax(-1) > 0.5 + _OFF
+    return int((off & seen).sum()) > int(seen.sum()) / 2
 
 
 def is_batch(named: Named, camera: object) -> bool:
@@ -426,7 +490,7 @@ def _ways(
             hows[name] = Sampler(mode, padding_mode, fill)
         elif found == "mask":
             hows[name] = Sampler("nearest", "zeros", (mask_fill,))
-        elif found != "boxes" and moves(found, value) is _pixels:
+        elif found not in BOXES and moves(found, value) is _pixels:
             hows |= {name: "pixels"} if is_single or value.numel() < _MANY_PIXELS else {}
         elif value.dtype == dtype and are_numbers(value):
             if found == "boxes":

@@ -62,7 +62,8 @@ class RandomCamera(CameraDrawer):
             the distance from the principal point.
         cos4: natural vignetting: power of cos^4 of a pixel's angle to the axis; 1 is natural, fisheyes have less, below
             0 it is undone. See `ct.vignetting`.
-        image_size: (height, width) of the result; default: the sample's. Fields of view are those in width.
+        image_size: (height, width) of the result; default: the sample's, also with a `like` of another size. Fields of
+            view are those in width.
         options: p, same_on_batch, camera, fields, mode, padding_mode, fill, antialias, tolerance, mask_fill, valid_mask
             and min_filled; see `Augmentation`.
 
@@ -102,7 +103,8 @@ class RandomMount(CameraDrawer):
     """The camera turned and rolled where it stands, and zoomed: any lens keeps its coefficients.
 
     Args are those of `RandomCamera`: yaw, pitch, roll in degrees, zoom, a range of `fov`, chromatic, vignetting, cos4,
-    image_size, and all options. On a pinhole camera this is the homography K' R K^-1.
+    image_size, and all options. On a pinhole camera this is the homography K' R K^-1. `yaw=25` draws from -25 to 25;
+    a fixed mount is `yaw=(25, 25), pitch=None, roll=None`.
 
         >>> augment = ct.augment.RandomMount(yaw=10, camera=ct.Pinhole([80.0, 80.0, 63.5, 47.5], image_size=(96, 128)))
         >>> sample = augment(image=torch.zeros(8, 3, 96, 128), gaze=torch.tensor([[0.0, 0.0, -1.0]] * 8))

@@ -58,6 +58,7 @@ from camtorch.values.arguments import (
     hinting,
     no_camera,
 )
+from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import GeometryModule
 from camtorch.values.threads import on_one_thread
 from camtorch.warp.sampling import Options, as_options
@@ -363,6 +364,8 @@ class SampleTransform(KeepsCamera, nn.Module):
         batched = not isinstance(sample, Single) and is_batch(named, camera)
         if not batched:
             self._sorted(sample, fields, single=True)  # raises for whole numbers of more than a row
+        images = [value for kind, value in named.values() if kind == "image"]
+        size = images[0][0].shape[-2:] if images and len(images[0]) else ()
         count = -1
         for name, (found, value) in named.items():
             several = isinstance(value, list)
@@ -373,8 +376,13 @@ class SampleTransform(KeepsCamera, nn.Module):
                 check(found, which, frame, batched and not several, self._name)
                 if not predicted:
                     check_values(found, which, item, self._name)
-                    if "image" in named:
-                        warn_of_numbers(found, which, item, f"{name}_valid" in sample, self._name)
+                    if found == "image":
+                        check_averaged(item, self.options["mode"], which, self._name)
+                    if len(size) == 2:
+                        flags = sample.get(f"{name}_valid")
+                        if several and flags is not None:
+                            flags = flags[i] if i < len(flags) else ()
+                        warn_of_numbers(found, which, item, flags, size, self._name)
             value = value if batched or several else value.unsqueeze(0)
             named[name], own = (found, value), len(value)
             count = own if count < 0 else count

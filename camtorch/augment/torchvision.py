@@ -61,7 +61,12 @@ class Transform(FrontEnd, v2.Transform):
     image if the sample has no other image and its name means nothing else. `valid=True` adds a flag for each point or
     box of a dict: `target["keypoints_valid"]`, a bool tensor, for `target["keypoints"]`: on the new image, and valid
     before. Flags that a sample already has are always updated. Count, order, formats and dtypes stay; canvas_size is
-    the new camera's. Gradients reach the inputs, not the cameras.
+    the new camera's. Gradients reach the inputs, not the cameras. A PIL image whose name has the kind mask, such as
+    `mask_iris`, moves as a mask.
+
+    Flips, crops and sizes of torchvision, before or after this transform, move keypoints and boxes, and leave `gaze`,
+    `head_pose` and `camera`. In their place take camtorch's own, in one transform:
+    `Transform(ct.augment.Compose([ct.augment.HorizontalFlip(landmarks="ibug68"), augmentation]), camera)`.
 
     Args:
         augmentation: the augmentation to apply.
@@ -134,6 +139,8 @@ class Transform(FrontEnd, v2.Transform):
             value = functools.reduce(lambda held, _: [held], range(lists), leaf)
             kinds[i] = next((kind for of, kind in _KINDS.items() if isinstance(leaf, of)), None)
             try:
+                if isinstance(leaf, PIL.Image.Image) and kind_of(name, [leaf], fields, _OWNER) == "mask":
+                    kinds[i] = "mask"
                 kinds[i] = kinds[i] or kind_of(name, value, fields, _OWNER, single)
             except ValueError as error:
                 problems[i] = error

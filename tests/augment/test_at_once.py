@@ -162,7 +162,7 @@ def odd_samples():
         "other precision": {"image": image.half(), "keypoints": pixels.half(), "landmarks": pixels.double()},
         "gaps": {"image": torch.cat((image, image), 2)[:, :, ::2], "keypoints": torch.cat((pixels, pixels), 1)[:, ::2]},
         "turned in memory": {"image": image.mT.contiguous().mT, "keypoints": pixels.T.contiguous().T},
-        "expanded": {"image": image[:1].expand(3, -1, -1), "keypoints": pixels[:1].expand(5, -1)},
+        "expanded": {"image": image[:1].expand(3, -1, -1), "keypoints": pixels[1:2].expand(5, -1)},
         "masks": {"image": image[:1], "mask": image[:1] > 99, "mask_b": image[:2].int(), "mask_c": image[0].double()},
         "a batch of one": {"image": image[None], "mask": image[None, 0], "keypoints": pixels[None]},
         "vectors": {

@@ -168,10 +168,11 @@ UNSIGNED = [torch.uint8, torch.uint16, torch.uint32, torch.uint64]
 @pytest.mark.parametrize("dtype", [*UNSIGNED, torch.float32, torch.int64, torch.bool])
 def test_whole_steps_copy_pixels(dtype):
     whole = torch.randint(2 if dtype == torch.bool else 200, (4, 3, *SIZE), generator=torch.Generator().manual_seed(0))
-    image, some = whole.to(dtype), A.HorizontalFlip()
+    how = {"mode": "nearest" if dtype in UNSIGNED[2:] or dtype == torch.int64 else "bilinear"}
+    image, some = whole.to(dtype), A.HorizontalFlip(**how)
     for k in range(4):
-        assert torch.equal(A.Rotate90(k)(image=image)["image"].long(), torch.rot90(whole, k, (-2, -1)))
-    padded = A.Pad((1, 2, 3, 4), fill=1)(image=image)["image"]
+        assert torch.equal(A.Rotate90(k, **how)(image=image)["image"].long(), torch.rot90(whole, k, (-2, -1)))
+    padded = A.Pad((1, 2, 3, 4), fill=1, **how)(image=image)["image"]
     assert torch.equal(padded.long(), F.pad(whole, (1, 3, 2, 4), value=1))
     torch.manual_seed(4)
     out = some(image=image, mask=image)
@@ -229,11 +230,11 @@ def mixture(**options):
 def test_chains_take_all_unsigned_integers(name, dtype):
     lens = ct.KannalaBrandt([200.0, 200, 159.5, 119.5], [0.01, 0, 0, 0], image_size=(240, 320))
     augment = {
-        "flip": lambda: A.Compose([A.RandomResizedCrop(40), A.HorizontalFlip()]),
-        "mount": lambda: A.Compose([A.RandomMount(yaw=10, camera=lens), A.RandomResizedCrop(40)]),
-        "turn": lambda: A.Compose([A.CenterCrop(200), A.Rotate90(), A.Resize(20)]),
-        "pad": lambda: A.Compose([A.HorizontalFlip(), A.CenterCrop((250, 400))], fill=(-1.0, 7.6, 3.0)),
-    }[name]()
+        "flip": lambda **how: A.Compose([A.RandomResizedCrop(40), A.HorizontalFlip()], **how),
+        "mount": lambda **how: A.Compose([A.RandomMount(yaw=10, camera=lens), A.RandomResizedCrop(40)], **how),
+        "turn": lambda **how: A.Compose([A.CenterCrop(200), A.Rotate90(), A.Resize(20)], **how),
+        "pad": lambda **how: A.Compose([A.HorizontalFlip(), A.CenterCrop((250, 400))], fill=(-1.0, 7.6, 3.0), **how),
+    }[name](mode="bilinear" if dtype == "uint16" else "nearest")
     images = torch.randint(0, 256, (3, 3, 240, 320), generator=torch.Generator().manual_seed(0))
     for seed in range(5):
         for count in (3, 1):
@@ -496,8 +497,9 @@ def test_pixels_without_a_ray_move_as_well():
     assert out["keypoints"].tolist() == [[[63.0, 2.0]]]
     assert out["keypoints_valid"].all()
     assert torch.equal(out["image"][..., 1:-1, 1:-1], image.flip(-1))
-    bad = A.HorizontalFlip(p=1.0)(image=image, keypoints=torch.tensor([[[torch.nan, 1.0], [1e30, 0.0]]]), camera=lens)
-    assert bad["keypoints_valid"].tolist() == [[False, False]]
+    pixels = torch.tensor([[[torch.nan, 1.0], [1e30, 0.0], [1.0, 1.0]]])
+    bad = A.HorizontalFlip(p=1.0)(image=image, keypoints=pixels, camera=lens)
+    assert bad["keypoints_valid"].tolist() == [[False, False, True]]
     assert torch.isfinite(bad["keypoints"]).all()
 
 

@@ -176,6 +176,19 @@ def test_nests_of_clips_and_of_names_that_are_there_twice(vision):
             torch.testing.assert_close(moved.as_subclass(torch.Tensor), value, rtol=0, atol=0)
 
 
+def test_a_grey_picture_moves_as_a_mask_if_its_name_is_one_of_a_mask(vision):
+    image, mask, *_ = images()
+    labels = PIL.Image.fromarray((30 * mask).astype(np.uint8))
+    transform = vision[0].Transform(augmentation(fields={"seg*": "mask"}), camera())
+    names = "mask", "mask_iris", "seg_map", "grey", "mask_path"
+    out = transform({"image": PIL.Image.fromarray(image), **dict.fromkeys(names[:4], labels), "mask_path": "a.png"})
+    assert out["mask_path"] == "a.png"
+    found = {name: set(np.unique(out[name]).tolist()) for name in names[:4]}
+    assert all(out[name].mode == "L" for name in found)
+    assert found.pop("grey") > {0, 210}
+    assert set(map(frozenset, found.values())) == {frozenset({0, 210})}
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.int64])
 @pytest.mark.parametrize("form", ["XYXY", "XYWH", "CXCYWH"])
 def test_boxes_enclose_their_masks_in_every_format(vision, form, dtype):
@@ -236,7 +249,7 @@ def test_what_would_not_move_or_be_misread_is_refused(vision):
         (front_end.Transform(augmentation()), image, "camera must be a Camera; got None"),
         (two, image, r"batch dims \(2,\)"),
         (front_end.Transform, ct.augment.FaceNormalizer(), "got FaceNormalizer"),
-        (augmentation(camera=camera()), {"image": image, "boxes": boxes}, "boxes must be x1, y1, x2, y2; got .*XYWH"),
+        (augmentation(camera=camera()), {"image": image, "boxes": boxes}, "must be .* x1, y1, x2, y2; got .*XYWH"),
         *((transform, {"box": one}, f"format {one.format.value}.*, pass their corners as keypoints") for one in turned),
     ):
         with pytest.raises((TypeError, ValueError), match=text):

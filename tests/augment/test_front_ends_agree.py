@@ -51,6 +51,8 @@ def sample(*batch):
         "landmarks": pixels(2, 5),
         "polygons": pixels(2, 4),
         "boxes": torch.tensor([[9.0, 8, 41, 38]]).repeat(*batch, 1, 1),
+        "boxes_xywh": torch.tensor([[9.0, 8, 32, 30]]).repeat(*batch, 1, 1),
+        "boxes_cxcywh": torch.tensor([[25.0, 23, 32, 30]]).repeat(*batch, 1, 1),
         "pitch_yaw": pixels() / 100,
         "head_pose": pose,
         "pose": pose,
