@@ -316,6 +316,7 @@ WARNINGS = {
     ),
     "landmarks": ("order", lambda: A.HorizontalFlip(p=1), {"keypoints": POINTS}),
     "not seen": ("warn_of_numbers", A.Resize, {"keypoints": torch.tensor([[3.0, 4], [-1, -1]])}),
+    "of a larger image": ("warn_of_numbers", A.Resize, {"keypoints": 9 * POINTS[:9]}),
     "parts": ("warn_of_numbers", A.Resize, {"keypoints": POINTS[:5] / 64}),
     "boxes of parts": ("warn_of_numbers", A.Resize, {"boxes": torch.tensor([[0.1, 0.2, 0.3, 0.4]])}),
     "a detector's points": (

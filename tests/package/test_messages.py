@@ -310,5 +310,4 @@ def test_warnings_show_the_callers_line(says):
 def test_there_is_one_way_to_warn():
     folder = Path(ct.__file__).parent
     files = [path for path in folder.rglob("*.py") if "warnings.warn(" in path.read_text()]
-    # the library is loaded at its first use, wherever that is
-    assert {path.relative_to(folder).as_posix() for path in files} == {"values/arguments.py", "native/library.py"}
+    assert {path.relative_to(folder).as_posix() for path in files} == {"values/arguments.py"}
