@@ -13,9 +13,7 @@ from typing import Any, TypeAlias
 
 import torch
 from kornia.augmentation import AugmentationSequential, IntensityAugmentationBase2D
-from kornia.augmentation.base import _BasicAugmentationBase
 from kornia.augmentation.container.image import ImageSequential
-from kornia.augmentation.container.params import ParamItem
 from kornia.constants import DataKey
 from kornia.geometry.boxes import Boxes
 from torch import Tensor, nn
@@ -25,6 +23,7 @@ from camtorch import augment
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
 from camtorch.augment.kinds import OWN, is_text, kind_of
+from camtorch.augment.kornia_parts import BasicAugmentationBase, ParamItem
 from camtorch.augment.sample import KeepsCamera, Sample, Single, detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import collate_cameras
@@ -151,7 +150,7 @@ def _fields(container: Any, sample: Sample, ours: list[InContainers], single: bo
     kinds = {n: kind for n, v in given.items() if v is not None and (kind := kind_of(n, v, own, owner, single))}
     names = [*kinds, *(["camera"] if sample.get("camera") is not None else [])]
     known = InContainers, IntensityAugmentationBase2D
-    others = (m for m in container.modules() if isinstance(m, _BasicAugmentationBase) and not isinstance(m, known))
+    others = (m for m in container.modules() if isinstance(m, BasicAugmentationBase) and not isinstance(m, known))
     for other in (type(module).__name__ for module in others if names):
         name = next((name for name in (other, other.removeprefix("Random")) if hasattr(augment, name)), None)
         how = f"camtorch.augment.kornia.{name}, which moves" if name else "augmentations of camtorch alone, which move"

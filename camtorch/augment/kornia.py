@@ -16,7 +16,6 @@ from typing import Any, TypeAlias, cast
 
 import torch
 from kornia.augmentation import GeometricAugmentationBase2D
-from kornia.augmentation.utils import _transform_output_shape
 from kornia.constants import Resample, SamplePadding
 from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
@@ -27,6 +26,7 @@ from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
 from camtorch.augment.containers import KIND, InContainers, Params, camera_of, kind_of_camera, with_boxes, with_cameras
 from camtorch.augment.front_end import check_front_end, check_single
+from camtorch.augment.kornia_parts import transform_output_shape
 from camtorch.augment.sample import detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
@@ -208,7 +208,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         shape, flags = params["forward_input_shape"], {**flags, "resample": Resample.NEAREST, **more, _BACK: True}
         rows = self.transform_tensor(input, shape=shape, match_channel=False)
         moved = self.apply_transform_mask(rows, params, flags)
-        return _transform_output_shape(moved, input.shape, reference_shape=shape) if self.keepdim else moved
+        return transform_output_shape(moved, input.shape, reference_shape=shape) if self.keepdim else moved
 
     def inverse_keypoints(self, input: Any, params: Params, flags: Flags, transform: Any = None, **_: Any) -> Any:
         return self.apply_transform_keypoint(input, params, {_BACK: True})

@@ -2,6 +2,8 @@ import copy
 import inspect
 import io
 import pickle
+import subprocess
+import sys
 
 import kornia.augmentation as K  # noqa: N812
 import pytest
@@ -396,3 +398,21 @@ def test_gradients_reach_cameras_of_samples(key):
 def test_private_names_of_kornia_are_as_the_front_end_takes_them(owner, name, parameters):
     """Other tests notice changes of `_params`, and of `_data` and `_valid` of labels."""
     assert " ".join(inspect.signature(getattr(owner, name)).parameters) == parameters
+
+
+@pytest.mark.parametrize(
+    ("without", "says"),
+    [
+        (
+            "kornia.augmentation.AugmentationSequential._preproc_boxes",
+            "lacks AugmentationSequential._preproc_boxes. Type pip",
+        ),
+        ("kornia.augmentation.utils._transform_output_shape", "cannot import name '_transform_output_shape'"),
+    ],
+)
+def test_a_kornia_that_lacks_a_part_is_refused_by_its_name(without, says):
+    code = (
+        f"import kornia.augmentation; del {without}\nimport camtorch as ct; ct.Pinhole\nimport camtorch.augment.kornia"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert says in done.stderr.splitlines()[-1]
