@@ -38,9 +38,9 @@ class Transform(FrontEnd, A.DualTransform):
     Other fields move by their names, as in `Augmentation`: `gaze`, `head_pose`, `depth` and so on, in pixels, with
     `<name>_valid` next to points and boxes. Numbers under an unknown name that might be geometry raise an error;
     `fields={"lidar": "points", "logits": "keep"}` of the augmentation gives their kinds. A `camera` in the sample is
-    that of its images; every result holds the new one, which the next transform of camtorch uses. Flips,
-    crops and sizes of albumentations, before or after this transform, move keypoints and boxes, and leave `gaze`,
-    `head_pose` and `camera`. In their place take camtorch's own, in one transform:
+    that of its images; every result holds the new one, which the next transform of camtorch uses. Flips, crops and
+    sizes of albumentations, before or after this transform, move keypoints and boxes, and leave `gaze`, `head_pose` and
+    `camera`. In their place take camtorch's own, in one transform:
     `Transform(ct.augment.Compose([ct.augment.HorizontalFlip(landmarks="ibug68"), augmentation]), camera)`. Numbers are
     drawn by the generator of the pipeline, `A.Compose(..., seed=...)`, and replayed by `A.ReplayCompose`. There are no
     gradients, and volumes are not supported.

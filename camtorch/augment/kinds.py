@@ -105,8 +105,7 @@ def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tup
     return change.points(pixels)
 
 
-_PLACED = {"boxes_xywh": 0.0, "boxes_cxcywh": 0.5}
-"""Kinds of boxes by place, width and height: how far along their sides the place is."""
+_PLACED = {"boxes_xywh": 0.0, "boxes_cxcywh": 0.5}  # boxes by place and sides: how far along them the place is
 
 
 def as_corners(kind: str, boxes: Tensor) -> Tensor:
@@ -125,10 +124,10 @@ def _sided_boxes(kind: str, form: str) -> Field:
         low, high = corners.split(2, -1)
         return torch.cat((low + _PLACED[kind] * (high - low), high - low), -1)
 
-    def move(change: Change, boxes: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-        return change.boxes(boxes, functools.partial(as_corners, kind), write)
-
-    return Field(2, 2, (4,), f"(B, M, 4) pixels {form}", move, True)
+    read = functools.partial(as_corners, kind)
+    return Field(
+        2, 2, (4,), f"(B, M, 4) pixels {form}", lambda change, boxes, _: change.boxes(boxes, read, write), True
+    )
 
 
 _DIRECTIONS = Field(
@@ -357,10 +356,7 @@ def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
 
 
 def warn_of_numbers(kind: str, name: str, value: Tensor, flags: Any, size: Sequence[int], owner: str) -> None:
-    """Warn of labels that seem to be parts of an image's sides, of an image of another `size`, or to mean "not seen".
-
-    flags: those given of points that are valid, or None.
-    """
+    """Warn of labels that seem to be parts of an image's sides, of an image of another size, or to mean "not seen"."""
     if kind not in (*BOXES, "keypoints", "landmarks") or not value.is_cpu:
         return
     pixels = value if kind in BOXES else value[..., :2]

@@ -47,7 +47,7 @@ class Transform(FrontEnd, v2.Transform):
     Values move by their type:
 
     * `Image`, `Video` (..., C, H, W) and PIL images; all frames of a clip share the draw. `Mask` (..., H, W) takes the
-      nearest value.
+      nearest value, and so do PIL images whose names have the kind mask, as in `mask_iris`.
     * `KeyPoints` (..., 2), in pixels whose centres are whole numbers. A point without a place on the new image becomes
       (-1, -1), also in all later transforms of camtorch.
     * `BoundingBoxes` of a format without rotation, in torchvision's coordinates between pixel edges. The new boxes
@@ -61,8 +61,7 @@ class Transform(FrontEnd, v2.Transform):
     image if the sample has no other image and its name means nothing else. `valid=True` adds a flag for each point or
     box of a dict: `target["keypoints_valid"]`, a bool tensor, for `target["keypoints"]`: on the new image, and valid
     before. Flags that a sample already has are always updated. Count, order, formats and dtypes stay; canvas_size is
-    the new camera's. Gradients reach the inputs, not the cameras. A PIL image whose name has the kind mask, such as
-    `mask_iris`, moves as a mask.
+    the new camera's. Gradients reach the inputs, not the cameras.
 
     Flips, crops and sizes of torchvision, before or after this transform, move keypoints and boxes, and leave `gaze`,
     `head_pose` and `camera`. In their place take camtorch's own, in one transform:

@@ -23,7 +23,6 @@ from camtorch.cameras.freezing import INTRINSICS, frozen_names
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_vector
 from camtorch.values.arguments import as_flag, as_number, as_whole, hinting, no_camera, shown, warn
-from camtorch.values.module import remade
 from camtorch.values.threads import on_one_thread
 
 STEPS = 300
@@ -48,7 +47,7 @@ class Model:
     def camera(self, parameters: Tensor, image_size: tuple[int, int] | None) -> Camera:
         """Return the camera of parameters (*B, 4 + n), with the same names frozen as in the camera to start from."""
         found = self.kind(*parameters.split((4, self.count) if self.count else 4, -1))
-        found = remade(found, image_size=image_size)  # crops may be off centre
+        found.image_size = image_size  # set later, as crops may be off centre
         if self.start is not None and (frozen := frozen_names(self.start)):
             found.freeze(*frozen)
         return found

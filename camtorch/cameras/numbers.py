@@ -29,6 +29,7 @@ from camtorch.values.arguments import (
 from camtorch.values.module import remade
 
 CameraT = TypeVar("CameraT", bound=CameraLike)
+Rows = list[list[float]]  # fx, fy, cx, cy of each camera
 _Checked = tuple[Tensor, Tensor, tuple[str, ...], torch.Size, tuple[int, int] | None]
 
 _OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
@@ -298,9 +299,6 @@ def camera_of_fov(
     return made
 
 
-Rows = list[list[float]]  # fx, fy, cx, cy of each camera
-
-
 def off_centre(intrinsics: Tensor, size: tuple[int, int]) -> Rows:
     """Return the rows of plain numbers (*B, 4); none if a principal point is near the middle of images of `size`."""
     if is_kept(intrinsics) or is_predicted(intrinsics):
@@ -345,21 +343,18 @@ def warn_of_order(rows: Rows, size: tuple[int, int], owner: str, order: str = "(
 def warn_of_size(rows: Rows, size: tuple[int, int], owner: str) -> None:
     """Warn of rows `off_centre` that seem to be of larger or of smaller images than those of `size`."""
     offs = [((cx + 0.5) / size[1] - 0.5, (cy + 0.5) / size[0] - 0.5) for _, _, cx, cy in rows]
-    is_far = all(min(off) > _FAR for off in offs) or all(max(off) < -_FAR for off in offs)
-    if rows and is_far and min(its := _size_about(*rows[0][2:])) >= _SIZE_LIKE:
+    if not rows or not (all(min(off) > _FAR for off in offs) or all(max(off) < -_FAR for off in offs)):
+        return
+    cx, cy = rows[0][2:]
+    known = [(int(a), int(b)) for a, b in (text.split("x") for text in _SIZES.split())]
+    its = min(known + [size[::-1] for size in known], key=lambda size: _off_centre(cx, cy, size))
+    its = its if _off_centre(cx, cy, its) < _NEAR / 2 else (16 * round(cy / 8), 16 * round(cx / 8))
+    if min(its) >= _SIZE_LIKE:
         warn(
             f"{owner}: fx, fy, cx, cy = {rows[0]} have their principal point far from the middle of images of {size}, "
             f"and seem to be of images of about (height, width) = {its}. Pass image_size={its}, then scale that camera "
             f"by .resize{size}. {_CUT_OUT}"
         )
-
-
-def _size_about(cx: float, cy: float) -> tuple[int, int]:
-    """Return the (height, width) whose middle is at a point: a common size that is near, else multiples of 16."""
-    sides = [tuple(map(int, text.split("x"))) for text in _SIZES.split()]
-    both = [pair for a, b in sides for pair in ((a, b), (b, a))]
-    near = min(both, key=lambda size: _off_centre(cx, cy, size))
-    return near if _off_centre(cx, cy, near) < _NEAR / 2 else (16 * round(cy / 8), 16 * round(cx / 8))
 
 
 def warn_of_exchange(old: tuple[int, int], new: tuple[int, int], owner: str, how: str = "stretched") -> None:

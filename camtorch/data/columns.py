@@ -11,7 +11,6 @@ import torch
 from camtorch.cameras.camera import MODELS, Camera, as_model
 from camtorch.cameras.mixed import cat
 from camtorch.values.arguments import as_image_size, no_camera
-from camtorch.values.module import remade
 
 PARTS = ("model", "intrinsics", "distortion", "image_size")
 
@@ -74,8 +73,9 @@ def camera_of(parts: Mapping[str, Any], owner: str) -> Camera:
         raise ValueError(f"{owner}: the model of a camera must be one of {', '.join(MODELS)}; got {model!r}")
     numbers = [_numbers(parts[part]) for part in ("intrinsics", "distortion") if parts.get(part) is not None]
     height, width = (int(side) for side in parts["image_size"])
-    camera: Camera = as_model(model, owner)(*(n for n in numbers if n.size)).requires_grad_(False)
-    return remade(camera, image_size=as_image_size((height, width), owner))  # crops may be off centre
+    camera: Camera = as_model(model, owner)(*(n for n in numbers if n.size))
+    camera.image_size = as_image_size((height, width), owner)  # set later, as crops may be off centre
+    return camera.requires_grad_(False)
 
 
 def _numbers(values: Any) -> np.ndarray[Any, Any]:

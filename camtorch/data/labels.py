@@ -29,7 +29,6 @@ from camtorch.io.photographs import load_stored
 from camtorch.models import BrownConrady, Pinhole
 from camtorch.poses.rotations import rotation_matrix
 from camtorch.values.arguments import LEFT, as_image_size, check_path, imported
-from camtorch.values.module import remade
 
 Json = dict[str, Any]
 Opened = tuple[Sequence[Any], TableLike | None]  # an entry for each sample, and the table of mirrored landmarks
@@ -254,8 +253,9 @@ def _pinhole(height_px: int, width_px: int, **lens: Any) -> Camera:
     matrix = lens["camera_matrix" if "camera_matrix" in lens else "camera_matrix_3x4"]
     distortion = lens.get("distortion_coeffs", lens.get("distortion_coeffs_1xN")) or None
     K = np.reshape(matrix, (3, 4))[:, :3].astype(np.float64)  # noqa: N806
-    camera = (BrownConrady if distortion else Pinhole).from_matrix(K, distortion).requires_grad_(False)
-    return remade(camera, image_size=as_image_size((height_px, width_px), "intrinsics_pinhole"))
+    camera = (BrownConrady if distortion else Pinhole).from_matrix(K, distortion)
+    camera.image_size = as_image_size((height_px, width_px), "intrinsics_pinhole")
+    return camera.requires_grad_(False)
 
 
 def _video_frame(path: Path, number: int) -> Tensor | None:

@@ -11,7 +11,6 @@ from camtorch.cameras.rig import Rig
 from camtorch.io.record import Names, Record, one_of
 from camtorch.models import FTheta, FThetaBackward
 from camtorch.values.arguments import LEFT
-from camtorch.values.module import remade
 
 NAMES = Names("ncore", "ncore")
 
@@ -51,9 +50,11 @@ def _f_theta(values: Record) -> Camera:
     centre, size = np.array(values["principal_point"].numbers(2)), values["resolution"].size()
     linear = linear if any(linear) else [1.0, 0.0, 0.0]  # ncore reads zeros as the identity
     try:
-        return remade(kind.from_polynomial(centre, np.array(rest), linear_cde=linear), image_size=size)
+        camera = kind.from_polynomial(centre, np.array(rest), linear_cde=linear)
     except ValueError as error:
-        return coefficients.fail(error)
+        coefficients.fail(error)
+    camera.image_size = size
+    return camera
 
 
 def _of_opencv(values: Record, kind: str) -> Camera:

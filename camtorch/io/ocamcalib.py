@@ -12,7 +12,6 @@ from camtorch.io import poses
 from camtorch.io.parsing import decoded
 from camtorch.io.record import CameraFileError, Names, Record
 from camtorch.models import OCamCalib
-from camtorch.values.module import remade
 
 NAMES = Names("ocamcalib", "OCamCalib")
 
@@ -51,6 +50,7 @@ def read(path: str, content: bytes) -> Rig:
     values = polynomial.numbers()[1:], centre.numbers(2), affine.numbers(3)
     try:
         camera = OCamCalib.from_ocamcalib(*map(poses.as_float64, values))
-        return Rig({"camera": remade(camera, image_size=(height, width))})
     except (ValueError, TypeError) as error:
-        return record.fail(error)
+        record.fail(error)
+    camera.image_size = height, width
+    return Rig({"camera": camera})

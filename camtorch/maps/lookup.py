@@ -108,8 +108,7 @@ class LookupMap:
     def __call__(self, images: Image, mode: str = "bilinear", padding_mode: str = "zeros") -> Image:
         """Warp images of the source's size, and return the same kind, as `Warp` does; dtypes are kept.
 
-        `mode` is "nearest", of which integers are exact up to 2^53, "bilinear" or "bicubic"; `padding_mode` is "zeros",
-        "border" or "reflection".
+        `mode` is "nearest" (integers are exact up to 2^53), "bilinear" or "bicubic", `padding_mode` as in `Warp`.
 
         Raises:
             ValueError: If the images have another shape or size, or integers but uint8 and uint16 would be averaged.

@@ -20,8 +20,7 @@ def check_averaged(images: Tensor, mode: str, name: str, owner: str) -> None:
     if mode != "nearest" and not images.dtype.is_floating_point and images.dtype not in _AVERAGED:
         raise ValueError(
             f"{owner}: {name} must be of floating point, uint8, uint16 or bool for mode={mode!r}, which averages; got "
-            f"{images.dtype}. Labels keep their values by mode='nearest'; numbers go in as {name}.float(), of an array "
-            f"{name}.astype('float32')"
+            f"{images.dtype}. Labels go in with mode='nearest', numbers as {name}.float() or .astype('float32')"
         )
 
 

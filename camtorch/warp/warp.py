@@ -363,8 +363,5 @@ def checked(
         raise ValueError(f"Warp: fill must have 1 value or {shape[-3]}, one for each channel; got {len(values)}")
     mode = warp.mode if mode is None else one_of(mode, MODES, "mode", "Warp")
     check_averaged(images, mode, "images", "Warp")
-    return Sampler(
-        mode,
-        warp.padding_mode if padding_mode is None else one_of(padding_mode, PADDINGS, "padding_mode", "Warp"),
-        values,
-    )
+    padding = warp.padding_mode if padding_mode is None else one_of(padding_mode, PADDINGS, "padding_mode", "Warp")
+    return Sampler(mode, padding, values)

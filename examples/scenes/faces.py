@@ -138,10 +138,9 @@ def cut(
     middle = torch.where(whole[:, None], middle, SIDE / 2)
     focal, centre = camera.intrinsics.expand(len(pixels), 4).split(2, -1)
     pixels_wide = round(wider * SIDE)
-    numbers = [torch.cat((focal * SIDE / side, (centre - middle) * SIDE / side + (pixels_wide - 1) / 2), -1)]
-    if camera.distortion_names:
-        numbers.append(camera.distortion.expand(len(pixels), -1))
-    return camera.replace(*numbers, image_size=(pixels_wide, pixels_wide)).requires_grad_(False), whole
+    numbers = torch.cat((focal * SIDE / side, (centre - middle) * SIDE / side + (pixels_wide - 1) / 2), -1)
+    k = camera.distortion.expand(len(pixels), -1) if camera.distortion_names else None
+    return camera.replace(numbers, k, (pixels_wide, pixels_wide)).requires_grad_(False), whole
 
 
 def corner_rays(camera: Camera) -> Tensor:
