@@ -661,7 +661,7 @@ const Viewer = (() => {
       context.moveTo(x, 6);
       context.lineTo(x, height - 20);
       context.stroke();
-      context.fillText(`${angle}°`, x - 8, height - 5);
+      context.fillText(`${angle}°`, Math.min(x - 8, width - 30), height - 5); // 180° is 28 px wide
     }
     context.fillText(`${Math.round(top)}`, 2, 16);
     context.fillText("px", 2, 30);
