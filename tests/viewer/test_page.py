@@ -29,6 +29,7 @@ ARGUMENTS = [
 ]
 IN_SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 SECOND = 1000
+THEME = Path(__file__).parents[2] / "docs" / "theme"
 
 
 @pytest.fixture(scope="module")
@@ -303,3 +304,21 @@ def test_where_webgl_is_slow_or_missing_the_canvas_draws(browsers, tmp_path):
         assert tab.evaluate("Viewer.renderer().kind") == "canvas"
         assert tab.evaluate("Viewer.viewSize") == [640, 480]
         tab.close()
+
+
+@pytest.mark.parametrize("width", [400, 1280])
+def test_frames_of_the_site_show_all_of_their_page(width, browsers):
+    css, js = ((THEME / f"site.{kind}").read_text() for kind in ("css", "js"))
+    frame = '<iframe class="viewer" src="viewer.html#model=kannala_brandt"></iframe>'
+    files = {"viewer.html": page(), "": f'<style>{css}</style><body class="md-typeset">{frame}<script>{js}</script>'}
+    tab = browsers["canvas"].new_page(viewport={"width": width, "height": 700})
+    for name, body in files.items():
+        tab.route(f"http://site/{name}", lambda route, _, body=body: route.fulfill(body=body, content_type="text/html"))
+    tab.goto("http://site/")
+    inside = tab.frames[1]
+    for model in ("kannala_brandt", "brown_conrady", "pinhole"):
+        inside.select_option("#model", model)
+        settled(inside)
+        inside.wait_for_function("document.documentElement.scrollHeight === innerHeight", timeout=5 * SECOND)
+        assert inside.evaluate("[...document.querySelectorAll('pre')].every((e) => e.scrollWidth <= e.clientWidth)")
+    tab.close()
