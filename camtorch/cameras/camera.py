@@ -15,7 +15,7 @@ from typing_extensions import Self, TypeVar
 
 from camtorch.cameras.catalogue import Catalogue
 from camtorch.cameras.editing import Editable
-from camtorch.cameras.freezing import INTRINSICS, PREFIX, Freezable, frozen_names, with_frozen
+from camtorch.cameras.freezing import INTRINSICS, PREFIX, Freezable, learning_words, with_frozen
 from camtorch.cameras.numbers import camera_of_fov, check_fast, checked_numbers, numbers_of_matrix, replaced
 from camtorch.convert.result import Conversion
 from camtorch.evaluate.kept import Kept
@@ -588,8 +588,7 @@ class Camera(Freezable, Editable):
             parts.append(f"distortion=({' '.join(self.distortion_names)})")
         if self.image_size:
             parts.append(f"image_size={self.image_size}")
-        parts += [f"frozen=({', '.join(frozen)})"] if (frozen := frozen_names(self)) else []
-        return ", ".join(parts)
+        return ", ".join([*parts, *learning_words(self)])
 
 
 def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:

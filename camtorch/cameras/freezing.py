@@ -59,6 +59,15 @@ def frozen_names(camera: CameraLike) -> tuple[str, ...]:
     return tuple(found)
 
 
+def learning_words(camera: CameraLike) -> list[str]:
+    """Return the end of `repr`: the dtype, "learns" if any parameter does, else "frozen", and all frozen names."""
+    names = frozen_names(camera)
+    tensors = [*camera.parameters(), *camera.buffers()]
+    learns = any(t.requires_grad for t in tensors) and len(names) < sum(len(own) for _, own in _tensors_of(camera))
+    words = [str(tensors[0].dtype).removeprefix("torch."), "learns" if learns else "frozen"]
+    return [*words, f"frozen=({', '.join(names)})"] if names else words
+
+
 def _freeze(camera: CameraLike, names: Sequence[str], frozen: bool) -> None:
     """Freeze the parameters of these names, or let them learn again; all of them if there are no names."""
     owner = f"{type(camera).__name__}.{'freeze' if frozen else 'unfreeze'}"

@@ -25,7 +25,7 @@ class Fisheye62(Camera):
 
     Example:
         >>> ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5], [0.1, 0.0, 0.0, 0.0]).convert("fisheye62").camera
-        Fisheye62(fx=300, fy=300, cx=319.5, cy=239.5, k0=0.1, k1=0, k2=0, k3=0, k4=0, k5=0, p0=0, p1=0)
+        Fisheye62(fx=300, fy=300, cx=319.5, cy=239.5, k0=0.1, k1=0, k2=0, k3=0, k4=0, k5=0, p0=0, p1=0, float64, learns)
     """
 
     key = "fisheye62"

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.freezing import INTRINSICS, frozen_names
+from camtorch.cameras.freezing import INTRINSICS, learning_words
 from camtorch.evaluate.known import values_of
 from camtorch.optics import Chart, Lens, Surface, Unified
 from camtorch.optics.surface import BEHIND
@@ -128,8 +128,7 @@ class Splined(Camera):
             parts += [f"{name}={value:.6g}" for name, value in zip(INTRINSICS, numbers.tolist(), strict=True)]
         parts.append(f"order={self.order}, columns={self.columns}, rows={self.rows}, fov_x={self.fov_x}")
         parts += [f"image_size={self.image_size}"] if self.image_size else []
-        parts += [f"frozen=({', '.join(names)})"] if (names := frozen_names(self)) else []
-        return ", ".join(parts)
+        return ", ".join([*parts, *learning_words(self)])
 
 
 def _optics_of(

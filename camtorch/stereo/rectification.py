@@ -227,7 +227,7 @@ def rectify(
         >>> camera = ct.KannalaBrandt([300.0, 300.0, 319.5, 239.5], [0.1, 0.0, 0.0, 0.0], image_size=(480, 640))
         >>> pair = ct.rectify(camera, camera, ct.Extrinsics([0.0, 0.0, 0.0], [-0.1, 0.0, 0.0]), projection="latlon")
         >>> pair.camera_left
-        LatLon(fx=299.996, fy=299.996, cx=292, cy=226.5, image_size=(454, 585))
+        LatLon(fx=299.996, fy=299.996, cx=292, cy=226.5, image_size=(454, 585), float32, frozen)
     """
     left, right = as_sized(left, "left", "rectify"), as_sized(right, "right", "rectify")
     one_of(projection, tuple(_KINDS), "projection", "rectify")

@@ -115,6 +115,8 @@ def test_copies_pickles_and_states_keep_it():
         assert "frozen=(fx, k2)" in repr(made)
     assert "frozen=(fx, k2)" in repr(copy.deepcopy(camera).to(torch.float64))
     assert "frozen" not in repr(camera.resize(24, 32))
+    assert ", float32, learns, frozen=(fx, k2)" in repr(camera)
+    assert ", float32, frozen, frozen=(fx, fy, " in repr(copy.deepcopy(camera).freeze())
     assert "frozen=(k2)" in repr(copy.deepcopy(camera).unfreeze("fx"))
     # a state of one that was not frozen leaves it to the module
     camera.load_state_dict(ct.KannalaBrandt([5.0, 6, 7, 8]).state_dict())

@@ -278,7 +278,8 @@ def test_repr(key):
     text = repr(camera)
     assert text.startswith(type(camera).__name__)
     assert f"fx={camera.intrinsics[0]:.6g}" in text
-    assert "480, 640" in text
+    assert text.endswith("image_size=(480, 640), float64, learns)")
+    assert ", float32, frozen)" in repr(camera.float().requires_grad_(False))
     named = () if key == "splined" else zip(camera.distortion_names, camera.distortion.tolist(), strict=True)
     for name, value in named:  # instead of hundreds of control points there is their grid
         assert re.search(rf"\b{name}={re.escape(f'{value:.6g}')}", text)

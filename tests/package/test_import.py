@@ -89,7 +89,7 @@ camera = pickle.load(open(sys.argv[1], "rb"))
 from torch.utils.data import default_collate
 print(camera, *default_collate([camera, camera]).batch_shape)
 """
-    assert python(code, str(tmp_path / "camera.pickle")) == "Pinhole(fx=1, fy=2, cx=3, cy=4) 2\n"
+    assert python(code, str(tmp_path / "camera.pickle")) == "Pinhole(fx=1, fy=2, cx=3, cy=4, float32, learns) 2\n"
 
 
 @pytest.mark.slow
