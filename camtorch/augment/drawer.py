@@ -17,7 +17,7 @@ from camtorch.augment.change import Change, Drawn, Part, no_turn
 from camtorch.augment.drawing import One, Start
 from camtorch.augment.elsewhere import twin_of
 from camtorch.augment.filling import enough, scaled
-from camtorch.augment.jitter import DRAWN, jittered
+from camtorch.augment.jitter import jittered
 from camtorch.augment.kinds import CHECKED, Form, check_values
 from camtorch.augment.presets import PRESETS
 from camtorch.augment.ranges import Range, RangeLike, as_range, draw_shares
@@ -28,6 +28,7 @@ from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free, are_numbers, known_false, with_derivatives_of
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
+from camtorch.native.structs import AMOUNTS
 from camtorch.optics.radial_inverse import precise
 from camtorch.poses.rotations import mount_elements
 from camtorch.rays.lattices import field_of_view
@@ -51,7 +52,7 @@ _LIMITS: dict[str, dict[str, Any]] = {
     "fov": {"least": _TINY, "most": 360},
     "focal": {"least": _TINY, "most": _HUGE, "around": 1},
     "centre": {"least": -1, "most": 1, "size": 2},
-    "distortion": {"least": -1, "most": 1, "size": DRAWN},
+    "distortion": {"least": -1, "most": 1, "size": AMOUNTS},
     "crop": {"least": _TINY, "most": 1},
     "place": {"size": 2},
     "chromatic": {"least": -0.5, "most": 0.5, "size": 2},

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Mapping, Sequence
-from ctypes import addressof, byref, c_double, c_int64, c_void_p
+from ctypes import addressof, c_double
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -14,50 +13,44 @@ from torch import Tensor
 
 from camtorch.augment.change import Drawn
 from camtorch.augment.filling import looked_at, with_care
-from camtorch.augment.jitter import DRAWN, PARTS, border, lens_ends, measured_once, sensitivity
+from camtorch.augment.jitter import PARTS, border, lens_ends, measured_once, sensitivity
 from camtorch.cameras.camera import Camera
+from camtorch.native.library import loaded
+from camtorch.native.structs import (
+    AMOUNTS,
+    AZIMUTHS,
+    CENTRE,
+    CROP,
+    DISTORTION,
+    DRAWN_KINDS,
+    EXTENT,
+    FOCAL,
+    LEFT_BASE,
+    LEFT_ENDS,
+    LEFT_LENS,
+    LEFT_SOURCE,
+    NO_CAMERA,
+    PITCH,
+    PLACE,
+    ROLL,
+    TOO_WIDE,
+    WIDTH,
+    YAW,
+    ZOOM,
+    Draws,
+)
 from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.projection.evaluation import rows_of
-from camtorch.projection.native_cameras import (
-    AZIMUTHS,
-    EXTENT,
-    CamerasStruct,
-    DomainStruct,
-    Lenses,
-    Native,
-    address,
-    entry,
-    fields,
-    lenses_of,
-)
+from camtorch.projection.native_cameras import Lenses, Native, address, lenses_of
 from camtorch.projection.rows import CameraRows, domain_for, single_native
 from camtorch.rays.lattices import defined_or
 from camtorch.values.module import model_of, remade
 from camtorch.warp.sampling import Options
 
-_SIZES = {"centre": 2, "distortion": DRAWN, "place": 2}
-_KINDS = "yaw", "pitch", "roll", "zoom", "fov", "focal", "centre", "distortion", "crop", "place"
+_SIZES = {"centre": 2, "distortion": AMOUNTS, "place": 2}
+_KINDS = {"yaw": YAW, "pitch": PITCH, "roll": ROLL, "zoom": ZOOM, "fov": WIDTH, "focal": FOCAL, "centre": CENTRE}
+_KINDS |= {"distortion": DISTORTION, "crop": CROP, "place": PLACE}
 _TURNS = {"yaw", "pitch", "roll"}
-_LEFT_BASE, _LEFT_LENS, _LEFT_ENDS, _TOO_WIDE, _NO_CAMERA, _LEFT_SOURCE = 1, 2, 4, 8, 16, 32
-
-
-class _Draws(ctypes.Structure):
-    """`Draws` of draws.h."""
-
-    _fields_ = fields(
-        "*values first cameras count height width is_each *sized *reach *coefficients *sensitivity *ends *base *border "
-        "*places domain *tries *tried *allowed share *source source_height source_width "
-        "*looked_at *factors *filled *room made *rotations *distortion followed copies",
-        copies=c_void_p * 3,
-        first=c_int64 * len(_KINDS),
-        height=c_double,
-        width=c_double,
-        share=c_double,
-        source_height=c_double,
-        source_width=c_double,
-        domain=DomainStruct,
-        made=CamerasStruct,
-    )
 
 
 class Start:
@@ -103,13 +96,13 @@ class Start:
         self._turns, self._moves, self._knows = not _TURNS.isdisjoint(names), nominal is not None, False
         self.dtype: torch.dtype = native.dtype
         self._follows = False  # whether new lenses want limits
-        self._distortion, self._kept = base.distortion.detach(), list[Any]()
+        self._distortion = base.distortion.detach()
         count = self._distortion.shape[-1]
-        call = self._call = _Draws(count=count, height=size[0], width=size[1], is_each=self._rows > 0)
-        call.first[:] = [-1] * len(_KINDS)
+        call = self._call = Draws(count=count, height=size[0], width=size[1], is_each=self._rows > 0)
+        call.first[:] = [-1] * DRAWN_KINDS
         at, self._room = 0, 13 + count
         for name in self.names:
-            call.first[_KINDS.index(name)], at = at, at + _SIZES.get(name, 1)
+            call.first[_KINDS[name]], at = at, at + _SIZES.get(name, 1)
         native.add_table()  # which whoever unprojects asks for
         call.base, call.made, call.made.usable = native.pointer, native.struct, None
         call.sized = self._keep(sized)
@@ -124,9 +117,7 @@ class Start:
 
     def _keep(self, tensor: Tensor, *row: int) -> int:
         """Keep a tensor, of each camera if there are several, and return where its numbers lie."""
-        tensor = (tensor.expand(self._rows, *row) if self._rows and row else tensor).contiguous()
-        self._kept.append(tensor)
-        return tensor.data_ptr()
+        return self._call.keep((tensor.expand(self._rows, *row) if self._rows and row else tensor).contiguous())
 
     def _add_coefficients(self, nominal: Tensor) -> None:
         call, base, native, lenses = self._call, self.base, self._native, self._native.lenses
@@ -154,7 +145,7 @@ class Start:
 
     def one(self, values: Sequence[float]) -> One | None:
         """Return the only new camera of values in a row, as they were drawn; None if it wants more than one call."""
-        call, dtype = _Draws.from_buffer_copy(self._call), self.dtype
+        call, dtype = Draws.from_buffer_copy(self._call), self.dtype
         numbers = (c_double * (len(values) + 2))(1, 1, *values)  # after the factor, and what is filled
         room, intrinsics = torch.empty(self._room, dtype=dtype, device="cpu"), torch.empty(4, dtype=dtype, device="cpu")
         distortion = torch.empty(call.count, dtype=dtype, device="cpu") if self._moves else self._distortion.clone()
@@ -163,9 +154,9 @@ class Start:
         call.room, call.factors = room.data_ptr(), addressof(numbers)
         call.filled, call.values = call.factors + 8, call.factors + 16
         turns, moves = None if rotation is None else rotation.data_ptr(), distortion.data_ptr() if self._moves else None
-        call.copies = intrinsics.data_ptr(), turns, moves
+        call.copies[:] = intrinsics.data_ptr(), turns, moves
         kept = [room, *self._add_limits(call, 1)]
-        if _run(call):
+        if loaded().camtorch_draws(call):
             return None
         if not call.followed and self._moves:
             call.made.limits2 = call.made.extent = None
@@ -179,7 +170,7 @@ class Start:
         factor, found = (torch.tensor([value], dtype=torch.float64) for value in (one.factor, one.filled))
         return Drawn(base, intrinsics, k, self.size, rotation, options, self.before, one.native, factor, found)
 
-    def _add_limits(self, call: _Draws, rows: int) -> list[Tensor]:
+    def _add_limits(self, call: Draws, rows: int) -> list[Tensor]:
         """Give room for the limits of new lenses, if some have wanted them."""
         if not self._follows:
             return []
@@ -187,7 +178,7 @@ class Start:
         call.made.limits2, call.made.extent = (tensor.data_ptr() for tensor in kept)
         return kept
 
-    def _made(self, call: _Draws, kept: list[Tensor], rows: int) -> Native:
+    def _made(self, call: Draws, kept: list[Tensor], rows: int) -> Native:
         """Return the new cameras for compiled code."""
         native = self._native
         lenses = partial(self._lenses, kept[0], rows) if self._knows else lambda _: native.lenses
@@ -195,7 +186,7 @@ class Start:
 
     def drawn(self, values: Mapping[str, Any], base: Camera, options: Options) -> Drawn:
         """Return the new cameras, modules like `base`, of values (B,) and (B, size), or numbers and lists for one."""
-        call, native = _Draws.from_buffer_copy(self._call), self._native
+        call, native = Draws.from_buffer_copy(self._call), self._native
         given = [values[name] for name in self.names]
         several = [len(value) for value in given if isinstance(value, np.ndarray)]
         rows, is_one = self._rows or (several[0] if several else 1), not (self._rows or several)
@@ -212,23 +203,23 @@ class Start:
         filled = torch.empty(2, rows, dtype=torch.float64, device="cpu")
         call.factors, call.filled = filled.data_ptr(), filled.data_ptr() + 8 * rows
         tries = self._tries(values, rows, call) if self._moves and not self._knows else None
-        kept = [room, *self._add_limits(call, rows)]
-        while (left := _run(call)) & ~_NO_CAMERA:
-            if left & _TOO_WIDE:
+        kept, run = [room, *self._add_limits(call, rows)], loaded().camtorch_draws
+        while (left := run(call)) & ~NO_CAMERA:
+            if left & TOO_WIDE:
                 widest = np.max(values["fov"])
                 raise ValueError(
                     f"fov must be within the reach of a {base.key} lens of these coefficients; got {widest:g} degrees"
                 )
-            if left & _LEFT_BASE:
+            if left & LEFT_BASE:
                 native.follow()
-            if left & _LEFT_SOURCE:
+            if left & LEFT_SOURCE:
                 self.before.follow()
-            if left & _LEFT_ENDS:
+            if left & LEFT_ENDS:
                 ends = measured_once(lens_ends, remade(self.base, image_size=self.size), self._distortion)
                 self._call.ends = call.ends = self._keep(ends, *ends.shape[-2:])
-            if left & _LEFT_LENS and tries is not None:
+            if left & LEFT_LENS and tries is not None:
                 tries.follow()
-            elif left & _LEFT_LENS:
+            elif left & LEFT_LENS:
                 self._follows = True
                 kept += self._add_limits(call, rows)
         if call.followed < rows and self._moves:
@@ -248,19 +239,20 @@ class Start:
             intrinsics = intrinsics.view(rows, 4)
         return Drawn(base, intrinsics, k, self.size, turned, options, self.before, made, filled[0], filled[1])
 
-    def _tries(self, values: Mapping[str, Any], rows: int, call: _Draws) -> Native:
+    def _tries(self, values: Mapping[str, Any], rows: int, call: Draws) -> Native:
         """Make the lenses that compiled code chooses among, of a model whose domain it does not make by itself."""
-        amounts = torch.from_numpy(np.asarray(values["distortion"]).reshape(-1, DRAWN))
-        steps = (amounts.repeat(1, -(-call.count // DRAWN))[:, : call.count] * self._sensitivity)[:, None]
+        amounts = torch.from_numpy(np.asarray(values["distortion"]).reshape(-1, AMOUNTS))
+        steps = (amounts.repeat(1, -(-call.count // AMOUNTS))[:, : call.count] * self._sensitivity)[:, None]
         given = self._distortion.double().reshape(-1, 1, call.count)
         tried = (given + given.new_tensor(PARTS)[:, None] * steps).to(self._native.dtype)
         tried, allowed = defined_or(self.base, tried, given.to(tried).expand_as(tried))
         tried = tried.reshape(rows * len(PARTS), call.count)
         native = CameraRows(model_of(self.base), tried.new_ones(len(tried), 4), tried).native
-        assert native is not None  # as the base has one
+        if native is None:
+            raise RuntimeError(f"lenses like {type(self.base).__name__} must have compiled code, as that has; got none")
         native.add_table()
         call.tries, call.tried, call.allowed = native.pointer, tried.data_ptr(), address(allowed)
-        call.kept = tried, allowed
+        call.hold((tried, allowed))
         return native
 
     def _lenses(self, room: Tensor, rows: int, made: Native) -> Lenses:
@@ -281,7 +273,3 @@ class One(NamedTuple):
     rotation: Tensor | None
     factor: float
     filled: float
-
-
-def _run(call: _Draws) -> int:
-    return int(entry("camtorch_draws", c_int64)(byref(call)))

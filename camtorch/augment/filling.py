@@ -10,6 +10,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import CameraNumbers, opaque
+from camtorch.native.structs import LOOKED_AT, SPREAD
 from camtorch.optics.radial_inverse import precise
 from camtorch.poses.rotations import rotation_matrix, rotation_vector
 from camtorch.values.arguments import broadcast_shapes
@@ -17,7 +18,6 @@ from camtorch.values.module import remade
 from camtorch.warp.boxes import along_edges
 from camtorch.warp.moving import moved_pixels
 
-_POINTS, _RIM = 1000, 16  # over the image, and along each of its edges
 _ROOT = 1.324717957244746
 _CARE = 0.01  # largest error of the share that points measure
 _NEARLY = 0.999
@@ -40,11 +40,11 @@ def looked_at(size: tuple[int, int], dtype: torch.dtype) -> Tensor:
     """Return the pixels (N, 2) that `filled` tests on images of a size: spread over the image, then on its rim."""
     height, width = size
     with torch.inference_mode(False):
-        steps = torch.arange(1, _POINTS + 1, dtype=torch.float64, device="cpu")[:, None]
+        steps = torch.arange(1, SPREAD + 1, dtype=torch.float64, device="cpu")[:, None]
         spread = (steps / steps.new_tensor([_ROOT, _ROOT**2])).frac()
         corners = spread.new_tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
         # half a pixel in, at the centres of the outermost pixels
-        rim = along_edges(corners * spread.new_tensor([width - 1, height - 1]), _RIM)
+        rim = along_edges(corners * spread.new_tensor([width - 1, height - 1]), (LOOKED_AT - SPREAD) // 4)
         return torch.cat((spread * spread.new_tensor([width, height]) - 0.5, rim)).to(dtype)
 
 
@@ -59,8 +59,8 @@ def _part_shown(
         pixels = centre + (pixels - centre) / zoom[..., None, None]
     pixels = pixels.expand(*broadcast_shapes(*shapes), *pixels.shape[-2:])
     _, shown = moved_pixels(target, source, None if rotation is None else rotation.mT, pixels, on_image=True)
-    part = shown[..., :_POINTS].to(pixels.dtype).mean(-1)
-    return torch.where(shown[..., _POINTS:].all(-1), part, part.clamp(max=_NEARLY))
+    part = shown[..., :SPREAD].to(pixels.dtype).mean(-1)
+    return torch.where(shown[..., SPREAD:].all(-1), part, part.clamp(max=_NEARLY))
 
 
 def scaled(camera: Camera, factor: Tensor) -> Camera:

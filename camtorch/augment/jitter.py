@@ -13,12 +13,11 @@ from torch import Tensor
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.opaque import CameraNumbers, opaque
 from camtorch.lenses.drawing import covering
+from camtorch.native.structs import AMOUNTS, RIM
 from camtorch.rays.lattices import defined_or, movement, polar_rays, reach
 from camtorch.values.module import remade
 from camtorch.warp.boxes import along_edges
 
-DRAWN = 16
-"""Number of coefficients that have a draw of their own; more take turns."""
 PARTS = 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125
 """Parts of a step, in the order in which they are tried."""
 _SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move less than radial terms: as in real lenses
@@ -45,7 +44,7 @@ def _shapes(camera: CameraNumbers, amounts: Tensor, nominal: Tensor) -> tuple[Te
 def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
     count = camera.distortion.shape[-1]
     measured = measured_once(sensitivity, camera, camera.distortion, nominal).to(amounts).reshape(-1, count)
-    steps = amounts.reshape(-1, DRAWN).repeat(1, -(-count // DRAWN))[:, :count] * measured
+    steps = amounts.reshape(-1, AMOUNTS).repeat(1, -(-count // AMOUNTS))[:, :count] * measured
     lens = remade(camera, intrinsics=camera.intrinsics.reshape(-1, 4), distortion=camera.distortion.reshape(-1, count))
     rim, given = _rim(lens), lens.distortion.expand_as(steps)
     if len(rim) < len(steps):
@@ -123,14 +122,14 @@ def border(size: tuple[int, int], dtype: torch.dtype) -> Tensor:
     height, width = size
     with torch.inference_mode(False):
         corners = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]], dtype=torch.float64) - 0.5
-        return along_edges(corners, 32).to(dtype)
+        return along_edges(corners, RIM // 4).to(dtype)
 
 
 def lens_ends(camera: Camera, distortion: Tensor) -> Tensor:
     """Return the last point (*B, K, 2), in focal lengths, along every azimuth that lenses map."""
     ones = distortion.new_tensor([1.0, 1.0, 0.0, 0.0]).double()
     plane = remade(camera, intrinsics=ones, distortion=distortion.detach().double())
-    azimuths = torch.linspace(0, 2 * math.pi, 128 + 1, dtype=torch.float64, device=ones.device)[:-1]
+    azimuths = torch.linspace(0, 2 * math.pi, RIM + 1, dtype=torch.float64, device=ones.device)[:-1]
 
     def seen(rays: Tensor) -> tuple[Tensor, Tensor]:
         return plane.project(rays.expand(*plane.batch_shape, *rays.shape[-3:]))

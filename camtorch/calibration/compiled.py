@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
-from ctypes import addressof, c_int64, c_void_p
+from ctypes import addressof, c_int64
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from camtorch.native.library import library
+from camtorch.native.library import library, loaded
+from camtorch.native.structs import (
+    AGREED,
+    CAUCHY,
+    FROM_RAYS,
+    HUBER,
+    LEAST_SQUARES,
+    REFINED,
+    SOLVED,
+    Poses,
+    Views,
+)
 from camtorch.poses.rotations import small_turn
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 
-_FROM_RAYS, _REFINED, _SOLVED, _AGREED = range(4)
-_LOSSES = (None, "huber", "cauchy")
+_LOSSES = {None: LEAST_SQUARES, "huber": HUBER, "cauchy": CAUCHY}
 _SHARED = 1 << 9  # points of poses for each further thread
-_Poses = struct.Struct("11q5d10q").pack  # the struct `Poses` of native/poses.h
-_Views = struct.Struct("16qd5q").pack  # the struct `Views` there
 
 
 class Search(NamedTuple):
@@ -51,21 +59,23 @@ def can_search(*tensors: Tensor) -> bool:
 
 def from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return rotations (B, 2, 3, 3), translations and valid as `poses_from_rays` does; row b sees points[b % P]."""
-    count = len(rays)
+    count, call = len(rays), Poses(task=FROM_RAYS)
     rotations, translations = rays.new_empty(count, 2, 3, 3), rays.new_empty(count, 2, 3)
-    results = rotations, translations, torch.empty(count, 2, dtype=torch.bool, device="cpu")
-    _run(None, points, rays, None, weights, _FROM_RAYS, Search(0, 0.0, 0.0, 0.0), 0.0, results)
-    return results
+    valid = torch.empty(count, 2, dtype=torch.bool, device="cpu")
+    call.rays, call.valid = call.keep(rays.contiguous()), valid.data_ptr()
+    _run(call, None, points, rays, weights, Search(0, 0.0, 0.0, 0.0), (rotations, translations))
+    return rotations, translations, valid
 
 
 def refine_poses(
     native: Native, points: Tensor, pixels: Tensor, weights: Tensor, start: tuple[Tensor, Tensor], search: Search
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return rotations, translations and costs (B,) of the minima near `start`; row b sees points[b % P]."""
-    converged, costs = torch.empty(len(pixels), dtype=torch.bool, device="cpu"), pixels.new_empty(len(pixels))
+    call, costs = Poses(task=REFINED), pixels.new_empty(len(pixels))
     rotations, translations = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in start)
-    results = rotations, translations, converged, costs
-    _run(native, points, None, pixels, weights, _REFINED, search, 0.0, results, start)
+    call.pixels, call.costs = call.keep(pixels.contiguous()), costs.data_ptr()
+    call.valid = call.keep(torch.empty(len(pixels), dtype=torch.bool, device="cpu"))
+    _run(call, native, points, pixels, weights, search, (rotations, translations), start)
     return rotations, translations, costs
 
 
@@ -84,9 +94,10 @@ def solve_poses(
     sizes = (3, 3), (3,), (3,), (), (6, 6)
     rotations, translations, vectors, rms, covariance = (pixels.new_empty(batch, *size) for size in sizes)
     valid, inliers = (torch.empty(size, dtype=torch.bool, device="cpu") for size in (batch, (batch, count)))
-    results = rotations, translations, valid, None, vectors, rms, inliers, covariance
-    task = _SOLVED if start is None else _AGREED
-    _run(native, points, None, pixels, weights, task, search, threshold, results, start or ())
+    call = Poses(task=SOLVED if start is None else AGREED, threshold=threshold)
+    call.pixels, call.valid, call.vectors = call.keep(pixels.contiguous()), valid.data_ptr(), vectors.data_ptr()
+    call.rms, call.inliers, call.covariance = rms.data_ptr(), inliers.data_ptr(), covariance.data_ptr()
+    _run(call, native, points, pixels, weights, search, (rotations, translations), start or ())
     return Solved(vectors, translations, rms, valid, inliers, covariance)
 
 
@@ -113,8 +124,7 @@ def project_views(
 
     Triangles are made if `learnt` lists the parameters that learn. poses: (B, V, 3, 3), (B, V, 3). loss: name, scale.
     """
-    compiled, plan, left = library(), native.plan, c_int64(0)
-    assert compiled is not None  # a `Native` exists only with the library
+    compiled, plan, left = loaded(), native.plan, c_int64(0)
     valid = torch.empty(weights.shape, dtype=torch.bool, device="cpu")
     residuals, weighed, cost = (t.new_empty(t.shape) for t in (pixels, weights, weights[..., 0]))
     wanted = learnt or ()
@@ -125,13 +135,16 @@ def project_views(
     size, numbers = len(wanted) + 1, (c_int64 * (len(wanted) + 1))(*wanted)
     view, shared = points.new_empty(count, points.shape[1], 6, 6 + size), points.new_empty(count, size, size)
     points = points if points.stride()[2:] == (3, 1) else points.contiguous()
-    given = [t.contiguous() for t in (*poses, pixels, weights)]
-    call = _Views(
-        *(native.pointer, points.data_ptr(), *points.stride()[:2]),
-        *(t.data_ptr() for t in (*given, residuals, weighed, valid, cost)),
-        *(*points.shape[:3], _LOSSES.index(loss[0]), loss[1]),
-        *(addressof(numbers), size - 1, view.data_ptr(), shared.data_ptr(), addressof(left)),
+    call = Views()
+    call.cameras, call.points, call.point_strides[:] = native.pointer, points.data_ptr(), points.stride()[:2]
+    call.rotations, call.translations, call.pixels, call.given = (
+        call.keep(t.contiguous()) for t in (*poses, pixels, weights)
     )
+    call.residuals, call.weights, call.valid, call.costs = (t.data_ptr() for t in (residuals, weighed, valid, cost))
+    call.problems, call.views, call.count = points.shape[:3]
+    call.loss, call.loss_scale = _LOSSES[loss[0]], loss[1]
+    call.learnt, call.columns, call.left = addressof(numbers), size - 1, addressof(left)
+    call.view, call.shared = view.data_ptr(), shared.data_ptr()
     compiled.camtorch_views(call)
     while left.value:
         if left.value < 0:
@@ -148,44 +161,39 @@ def turn(rotations: Tensor, steps: Tensor) -> Tensor:
     if compiled is None:
         return small_turn(steps[..., :3]) @ rotations
     made, steps = rotations.clone(memory_format=torch.contiguous_format), steps.contiguous()
-    places = c_void_p(steps.data_ptr()), c_int64(steps.shape[-1]), c_void_p(made.data_ptr())
-    compiled.camtorch_turns(*places, c_int64(made.numel() // 9))
+    compiled.camtorch_turns(steps.data_ptr(), steps.shape[-1], made.data_ptr(), made.numel() // 9)
     return made
 
 
 def _run(
+    call: Poses,
     native: Native | None,
     points: Tensor,
-    rays: Tensor | None,
-    pixels: Tensor | None,
+    rows: Tensor,
     weights: Tensor | None,
-    task: int,
     search: Search,
-    threshold: float,
-    results: tuple[Tensor | None, ...],
+    poses: tuple[Tensor, Tensor],
     start: tuple[Tensor, ...] = (),
 ) -> None:
-    """Run the compiled task, again if points need lens values that are not known yet. `start`: the first results."""
-    compiled = library()
-    assert compiled is not None  # see `can_search`
-    given = [None if t is None else t.contiguous() for t in (points, rays, pixels, weights)]
-    rows = next(t for t in (rays, pixels) if t is not None)
+    """Run a task for rows of rays or pixels, again if points need lens values that are not known yet.
+
+    Rotations and translations, which are `poses` in the end, begin at `start`.
+    """
     batch, count = rows.shape[:2]
     counters, threads = (c_int64 * 2)(), min(thread_count(), batch, 1 + batch * count // _SHARED) if batch > 1 else 1
-    call = _Poses(
-        0 if native is None else native.pointer,
-        *(0 if t is None else t.data_ptr() for t in given),
-        *(len(points), batch, count, task, _LOSSES.index(search.loss), search.steps),
-        *(search.loss_scale, search.settled, search.nothing, search.damping, threshold),
-        *(0 if t is None else t.data_ptr() for t in results),
-        *(*[0] * (8 - len(results)), addressof(counters), addressof(counters) + 8),
-    )
+    call.cameras, call.points = None if native is None else native.pointer, call.keep(points.contiguous())
+    call.weights = None if weights is None else call.keep(weights.contiguous())
+    call.point_rows, call.row_count, call.count = len(points), batch, count
+    call.loss, call.loss_scale, call.steps = _LOSSES[search.loss], search.loss_scale, search.steps
+    call.settled, call.nothing, call.damping = search.settled, search.nothing, search.damping
+    call.rotations, call.translations = (t.data_ptr() for t in poses)
+    call.next, call.left = addressof(counters), addressof(counters) + 8
+    run = partial(loaded().camtorch_poses, call)
     while True:
-        for to, first in zip(results, start, strict=False):
-            assert to is not None
+        for to, first in zip(poses, start, strict=False):
             to.copy_(first)
         counters[:] = [0, 0]
-        spread(lambda: compiled.camtorch_poses(call), threads)
+        spread(run, threads)
         if counters[1] < 0:
             raise MemoryError(f"no memory for poses of {count} points")
         if not counters[1] or native is None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
-import struct
+from ctypes import addressof, c_int64
 from functools import partial
 from typing import NamedTuple
 
@@ -13,6 +12,7 @@ from torch.nn.functional import pad
 
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.native.library import library
+from camtorch.native.structs import Agreement
 from camtorch.poses.rotations import small_turn
 from camtorch.values.threads import spread, thread_count
 
@@ -25,7 +25,6 @@ _MOST, _MOST_OF_FOUR = 1 << 17, 1 << 14
 _TRIED, _STEPS = 8, 3  # the best poses of a round, and the fits of each to the points near it
 _AT_ONCE = 1 << 19  # numbers of a tensor, at most
 _SHARED = 1 << 16  # points of samples for each further thread
-_Agreement = struct.Struct("12qdq").pack  # `Agreement` of native/consensus.h
 
 
 class _Lines(NamedTuple):
@@ -89,18 +88,15 @@ def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, thresh
         samples, size = _NEXT if drawn else _FIRST, 4 if compiled is None else 3
         numbers = torch.rand(samples, 3 if compiled else count, generator=generator, dtype=torch.float64)
         if compiled is not None:
-            given = [
-                lines.points.mT.contiguous(),
-                lines.measures.mT.contiguous(),
-                *search[1:3],
-                numbers,
-                *search[3:],
-                rows,
-            ]
-            following, places = ctypes.c_int64(0), [t.data_ptr() for t in given]
-            sizes = len(rows), count, samples, threshold**2, ctypes.addressof(following)
+            call, following = Agreement(), c_int64(0)
+            call.points = call.keep(lines.points.mT.contiguous())
+            call.measures = call.keep(lines.measures.mT.contiguous())
+            call.order, call.counts, call.numbers = order.data_ptr(), counts.data_ptr(), numbers.data_ptr()
+            call.best, call.costs, call.agree = best.data_ptr(), costs.data_ptr(), agree.data_ptr()
+            call.rows, call.row_count, call.count, call.samples = rows.data_ptr(), len(rows), count, samples
+            call.most, call.next = threshold**2, addressof(following)
             threads = min(thread_count(), len(rows), 1 + len(rows) * samples * count // _SHARED)
-            spread(partial(compiled.camtorch_consensus, _Agreement(*places, *sizes)), threads)
+            spread(partial(compiled.camtorch_consensus, call), threads)
         else:
             search.round(rows, numbers.to(points.device))
         drawn += samples

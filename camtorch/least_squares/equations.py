@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import struct
 from ctypes import addressof, c_int64
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from camtorch.native.library import library
+from camtorch.native.library import library, loaded
+from camtorch.native.structs import Steps
 
 
 class Equations(NamedTuple):
@@ -26,7 +26,6 @@ class Equations(NamedTuple):
 
 _NOTHING = 1e-20  # of a column's squares: the rounding left of a column that is a sum of others
 _FEW = 64  # shared unknowns, up to which compiled code is faster than LAPACK
-_Steps = struct.Struct("11q").pack  # the struct `Steps` of native/poses.h
 _FIRM = 1e-4  # of the largest singular value: smaller ones belong to unknowns that the data hardly determine
 
 
@@ -113,11 +112,12 @@ class System:
         given = [t.contiguous() for t in (self.equations.view, self.equations.shared, damping)]
         (count, views), columns = given[0].shape[:2], given[1].shape[-1] - 1
         of_views, whole = damping.new_empty(count, views, self.width), damping.new_empty(count, columns)
-        left, made = c_int64(0), (of_views, whole, rest := torch.empty_like(damping))
-        sizes, places = (count, views, self.width, columns), [t.data_ptr() for t in (*given, *made)]
-        compiled = library()
-        assert compiled is not None  # the caller checked that there is a library
-        compiled.camtorch_steps(_Steps(*places[:3], *sizes, *places[3:], addressof(left)))
+        left, rest, call = c_int64(0), torch.empty_like(damping), Steps()
+        call.view, call.shared, call.damping = (t.data_ptr() for t in given)
+        call.problems, call.views, call.width, call.columns = count, views, self.width, columns
+        call.of_views, call.of_shared, call.rest = (t.data_ptr() for t in (of_views, whole, rest))
+        call.left = addressof(left)
+        loaded().camtorch_steps(call)
         if left.value:
             raise MemoryError(f"no memory for {views} views. Pass fewer")
         return (of_views, whole), self.decrement - rest

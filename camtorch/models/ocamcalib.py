@@ -12,6 +12,7 @@ from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.known import known_false
+from camtorch.native.structs import ANGLE_OF_ALL_POWERS
 from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Shear
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.special import first_root
@@ -21,7 +22,7 @@ from camtorch.values.arguments import Numbers, as_real
 class AngleOfAllPowers(AnglePerRadius):
     """Radial factor theta / r of the ray (r, 0, D), D = 1 + a1 r + a2 r^2 + ..."""
 
-    code: ClassVar[int | None] = 5
+    code: ClassVar[int | None] = ANGLE_OF_ALL_POWERS
 
     def __init__(self, coefficients: Sequence[Tensor]):
         super().__init__(coefficients)

@@ -14,6 +14,7 @@ from torch import Tensor
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.freezing import INTRINSICS, learning_words
 from camtorch.evaluate.known import values_of
+from camtorch.native.structs import UNIFIED
 from camtorch.optics import Chart, Lens, Surface, Unified
 from camtorch.optics.surface import BEHIND
 from camtorch.values.arguments import as_whole, hinting
@@ -24,7 +25,7 @@ _VARIANT = re.compile(r"order=(\d),columns=(\d{1,3}),rows=(\d{1,3}),fov_x=(\d{1,
 class StereographicUpTo(Unified):
     """The stereographic chart of a lens that ends within a radius."""
 
-    code: ClassVar[int | None] = 3
+    code: ClassVar[int | None] = UNIFIED
 
     def __init__(self, last: float):
         super().__init__(alpha=0.5)

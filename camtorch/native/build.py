@@ -2,13 +2,17 @@
 
 `kernel.c` is compiled once for each kind of CPU, `dispatch.c` once; one shared library of both has no symbol of Python
 or torch, so it fits every version of them. It never has `-march=native`, as it may move to another machine, nor
-with `-ffast-math`, which links code that changes how the whole process rounds.
+with `-ffast-math`, which links code that changes how the whole process rounds. A unit is compiled again if its text,
+without comments, that of its headers, the options or the compiler have changed; `CAMTORCH_VARIANTS=baseline` compiles
+for one kind of CPU, to try out a change.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -16,8 +20,8 @@ import sys
 import sysconfig
 import tempfile
 import zlib
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 _HERE = Path(__file__).resolve().parent
@@ -82,43 +86,74 @@ def build(directory: str | os.PathLike[str] | None = None, *, sources: str | os.
     command = _compiler()
     here = _HERE if sources is None else Path(sources).absolute()
     target = (_HERE if directory is None else Path(directory).absolute()) / LIBRARY
+    wanted = _wanted()
     # next to the target: a file is renamed in one step only on one file system
     with tempfile.TemporaryDirectory(prefix="_building", dir=target.parent) as folder:
 
-        def compiled(source: Path, name: str, flags: Sequence[str], defined: Sequence[str] = ()) -> str:
-            words = [*_FLAGS, *flags, *(f"-D{word}" for word in defined), "-c", str(source), "-o", f"{name}.o"]
-            _run([*command, *words], folder)
-            return f"{name}.o"
-
         def accepts(flags: tuple[str, ...]) -> bool:
             # a compiler may be too old for a kind of CPU, or for another machine
-            probe = Path(folder, "probe.c")
-            probe.write_text("int probe(int x) { return x + 1; }\n")
+            Path(folder, "probe.c").write_text("int probe(int x) { return x + 1; }\n")
             try:
-                compiled(probe, "probe", flags)
+                _run([*command, *_FLAGS, *flags, "-c", "probe.c"], folder)
             except BuildError:
                 return not flags  # without flags, the sources show the true reason
             return True
 
-        known = {name: flags for name, flags in VARIANTS.items() if accepts(flags)}
-        has = [f"HAS_{name.upper()}" for name in known if name != "baseline"]
-        has.append(f"SOURCES={checksum(here)}u")
-        units: list[tuple[Path, str, tuple[str, ...], list[str]]] = [(here / "dispatch.c", "dispatch", (), has)]
-        kernels = [here / name for name in _KERNELS if (here / name).exists()]
-        units += [
-            (kernel, f"{kernel.stem}_{name}", flags, [f"VARIANT={name}"])
-            for kernel in kernels
-            for name, flags in known.items()
-        ]
+        known = {name: flags for name, flags in VARIANTS.items() if name in wanted and accepts(flags)}
+        # by its path, as a package's build has no package
+        Path(folder, "layout.h").write_text(runpy.run_path(str(_HERE / "headers.py"))["layout_h"](here), "utf-8")
+        has = [*(f"-DHAS_{name.upper()}" for name in known if name != "baseline"), f"-DSOURCES={checksum(here)}u"]
+        units = {"dispatch": [str(here / "dispatch.c"), "-I.", *has]}
+        for kernel in (here / name for name in _KERNELS if (here / name).exists()):
+            units |= {f"{kernel.stem}_{name}": [str(kernel), *known[name], f"-DVARIANT={name}"] for name in known}
+        objects = _objects(here) or Path(folder)
+        version = _run([*command, "--version"], folder)
+
+        def kept(name: str) -> Path:
+            """Return where a unit's object is, or will be: its name has a checksum of all that it is made of."""
+            words = [*command, *_FLAGS, *units[name]]
+            text = _run([*words, "-E", "-P"], folder)  # without comments
+            made_of = hashlib.sha256("\0".join([version, *words, text]).encode()).hexdigest()
+            return objects / f"{name}.{made_of[:16]}.o"
+
+        def compiled(name: str) -> None:
+            part = objects / f"{name}.{os.getpid()}"
+            _run([*command, *_FLAGS, *units[name], "-c", "-o", str(part)], folder)
+            for old in objects.glob(f"{name}.*.o"):
+                old.unlink(missing_ok=True)
+            os.replace(part, places[name])
+
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            objects = list(pool.map(lambda unit: compiled(*unit), units))
+            places = dict(zip(units, pool.map(kept, units), strict=True))
+            missing = [name for name, place in places.items() if not place.exists()]
+            if len(missing) > 1:
+                what = f"compiling {len(missing)} units of {len(units)}, for {', '.join(known)}"
+                print(f"{what}: geometry and kernel take most of the time, some 10 s each", file=sys.stderr, flush=True)
+            list(pool.map(compiled, missing))
         libraries = [] if sys.platform == "win32" else ["-lm"]
-        _run([*command, "-shared", "-o", LIBRARY, *objects, *libraries], folder)
+        _run([*command, "-shared", "-o", LIBRARY, *map(str, places.values()), *libraries], folder)
         os.replace(Path(folder, LIBRARY), target)
     return target
 
 
-def _run(command: list[str], folder: str) -> None:
+def _wanted() -> set[str]:
+    """Return the kinds of CPU that the environment's CAMTORCH_VARIANTS names, or all; the first one is always there."""
+    named = {name for name in os.environ.get("CAMTORCH_VARIANTS", "").replace(" ", "").split(",") if name}
+    if not named <= set(VARIANTS):
+        raise BuildError(f"CAMTORCH_VARIANTS must be some of {','.join(VARIANTS)}; got {','.join(sorted(named))}")
+    return named | {"baseline"} if named else set(VARIANTS)
+
+
+def _objects(sources: Path) -> Path | None:
+    """Return the folder of objects that later builds use again, or None if it cannot be written."""
+    folder = sources / "_objects"
+    with suppress(OSError):
+        folder.mkdir(exist_ok=True)
+        return folder if os.access(folder, os.W_OK) else None
+    return None
+
+
+def _run(command: list[str], folder: str) -> str:
     try:
         done = subprocess.run(
             command,
@@ -133,6 +168,7 @@ def _run(command: list[str], folder: str) -> None:
         raise BuildError(f"{error}\n(of {shlex.join(command)})") from error
     if done.returncode:
         raise BuildError(f"{(done.stderr + done.stdout).strip()}\n(of {shlex.join(command)})")
+    return done.stdout
 
 
 def _compiler() -> list[str]:

@@ -1,4 +1,4 @@
-/* What Python hands to the search for poses. calibration/ransac.py has the same fields. */
+/* What Python hands to the search for poses. */
 #ifndef CAMTORCH_CONSENSUS_H
 #define CAMTORCH_CONSENSUS_H
 

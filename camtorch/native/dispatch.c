@@ -1,4 +1,6 @@
 /* The entry points: each is that of the best variant that this CPU can run, or of the one that was asked for. */
+#include <layout.h> /* which the build makes of these headers, see headers.py: sizes and offsets by the names of fields */
+#include <stddef.h>
 #include <string.h>
 
 #include "consensus.h"
@@ -75,6 +77,14 @@ EXPORTED int32_t camtorch_use(const char *name) {
 }
 
 EXPORTED unsigned camtorch_sources(void) { return SOURCES; }
+
+/* Which structures these are; that of structs.py is the same */
+EXPORTED unsigned camtorch_layout(void) {
+    static const uint32_t numbers[] = {OFFSETS};
+    uint32_t sum = LAYOUT;
+    for (size_t i = 0; i < sizeof numbers / sizeof *numbers; i++) sum = (sum ^ numbers[i]) * 16777619u;
+    return sum;
+}
 
 EXPORTED const char *camtorch_variant(void) { return NAMES[variant()]; }
 

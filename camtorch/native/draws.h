@@ -1,4 +1,4 @@
-/* What Python hands to the making of drawn cameras. augment/drawing.py has the same fields. */
+/* What Python hands to the making of drawn cameras. */
 #ifndef CAMTORCH_DRAWS_H
 #define CAMTORCH_DRAWS_H
 

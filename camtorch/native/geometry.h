@@ -1,4 +1,4 @@
-/* What Python hands to the geometry: codes of what optics are made of, numbers, rows. projection/compiled.py has the same fields.
+/* What Python hands to the geometry: codes of what optics are made of, numbers, rows.
  *
  * The formulas are those of camtorch/optics, named alike there, and their sources stand there.
  */

@@ -8,16 +8,19 @@ import os
 from pathlib import Path
 
 from camtorch.native.build import LIBRARY, REASON, VARIANTS, checksum, switched_off
+from camtorch.native.known import wrong
+from camtorch.native.structs import LAYOUT, Library
 
 _HERE = Path(__file__).resolve().parent
 _BUILD = "python -m camtorch.native.build"
+_HEADERS = "python -m camtorch.native.headers"
 # 78 of the 94 rows of docs/performance.json with both figures are within these
 _SLOWER = "without it most work on the CPU takes 4 to 80 times as long"
 _told: set[str] = set()
 
 
 @functools.cache
-def _find() -> tuple[ctypes.CDLL | None, str]:
+def _find() -> tuple[Library | None, str]:
     """Return the library, and its CPU's kind or why there is none."""
     if switched_off():
         return None, "off (CAMTORCH_NATIVE=0)"
@@ -27,25 +30,35 @@ def _find() -> tuple[ctypes.CDLL | None, str]:
         why = reason.read_text("utf-8").strip() if reason.exists() else "camtorch was not installed from here"
         return None, f"not built ({why}); with a C compiler `{_BUILD}` builds it; {_SLOWER}"
     try:
-        library = ctypes.CDLL(str(path))
+        library = Library(str(path))
     except OSError as error:
         return None, f"not loaded ({error}); `{_BUILD}` builds it again; {_SLOWER}"
-    here, built_from = checksum(), getattr(library, "camtorch_sources", None)
-    if built_from is not None:
-        built_from.restype = ctypes.c_uint32
-    if here is not None and (built_from is None or built_from() != here):  # None if a package leaves the sources out
+    here, built_from, layout = checksum(), *(_number(library, name) for name in ("camtorch_sources", "camtorch_layout"))
+    if here is not None and built_from != here:  # None if a package leaves the sources out
         why = "not used (built from other sources than those beside it)"
         return None, f"{why}; `{_BUILD}` or `pip install -e .` builds it again; {_SLOWER}"
+    if layout != LAYOUT:
+        why = "not used (its structures, values or calls are not those of camtorch/native/structs.py)"
+        return None, f"{why}; `{_HEADERS}` writes that file, `{_BUILD}` builds the library again; {_SLOWER}"
+    library.declare()
     wanted = os.environ.get("CAMTORCH_CPU", "").strip().lower()
     if wanted and not library.camtorch_use(wanted.encode()):
         names = ", ".join(name for name in VARIANTS if library.camtorch_use(name.encode()))
         raise ValueError(f"CAMTORCH_CPU must be one of {names} on this CPU; got {wanted!r}. Unset it to use the best")
-    library.camtorch_variant.restype = ctypes.c_char_p
+    if (name := wrong(library)) is not None:
+        return None, f"not used ({name} gives a wrong answer to a known call); `{_BUILD}` builds it again; {_SLOWER}"
     return library, library.camtorch_variant().decode()
 
 
+def _number(library: Library, name: str) -> int | None:
+    call = getattr(library, name, None)
+    if call is not None:
+        call.restype = ctypes.c_uint32
+    return call and call()
+
+
 @functools.cache
-def library() -> ctypes.CDLL | None:
+def library() -> Library | None:
     """Return the library, loaded at first use, or None if there is none to use; its calls do not hold Python's lock."""
     return _find()[0]
 
@@ -64,6 +77,15 @@ def warn_if_missing() -> None:
     _told.add(state())
     if (worker := get_worker_info()) is None or worker.id == 0:
         warn(f"camtorch's compiled library is {state()}. CAMTORCH_NATIVE=0 in the environment says that it is meant so")
+
+
+@functools.cache
+def loaded() -> Library:
+    """Return the library, for calls that are made only if there is one."""
+    found = library()
+    if found is None:
+        raise RuntimeError(f"camtorch: the native sampler must be there for compiled calls; got none: it is {state()}")
+    return found
 
 
 def state() -> str:

@@ -1,4 +1,4 @@
-/* What Python hands to the search for poses. calibration/compiled.py has the same fields. */
+/* What Python hands to the search for poses. */
 #ifndef CAMTORCH_POSES_H
 #define CAMTORCH_POSES_H
 

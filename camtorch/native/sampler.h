@@ -1,4 +1,4 @@
-/* What Python hands to the sampler: plain pointers and sizes. `sampler.py` has the same fields in the same order. */
+/* What Python hands to the sampler: plain pointers and sizes. headers.py makes the same structures in structs.py of these. */
 #ifndef CAMTORCH_SAMPLER_H
 #define CAMTORCH_SAMPLER_H
 
@@ -18,7 +18,7 @@ enum { ZEROS, BORDER, REFLECTION };
 enum { SCRATCH = 25 };
 enum { STEP = 8 }; /* pixels between the nodes of a lattice */
 /* quintics do there, which are to be laid; cubics may miss; to be computed next; and others that have no place in `exact` */
-enum { CELL_QUINTIC = -5, CELL_DOUBT, CELL_NEXT, CELL_EMPTY, CELL_CUBIC };
+enum { CELL_QUINTIC = -5, CELL_DOUBT, CELL_NEXT, CELL_EMPTY, CELL_CUBIC, CELL_TODO };
 
 typedef struct {
     /* images (b, c, y, x) and results, in elements; a source image may serve all results (stride 0) */
@@ -59,7 +59,7 @@ typedef struct {
     int64_t count, rows, columns, height, width;
     double source_height, source_width, tolerance;
     int32_t padding; /* that is to be sampled with: what lies off the image then matters, or does not */
-    /* (b, rows, columns): CELL_EMPTY, CELL_CUBIC, CELL_DOUBT, or 0 where positions are to be exact */
+    /* (b, rows, columns): CELL_EMPTY, CELL_CUBIC, CELL_DOUBT, or CELL_TODO where positions are to be exact */
     int32_t *cells;
     float *scratch; /* SCRATCH (columns + 8), and of lattices as often as there are */
 } Classification;

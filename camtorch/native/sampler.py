@@ -2,34 +2,42 @@
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import math
-import struct
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from camtorch.native import memory
-from camtorch.native.library import library
+from camtorch.native.library import loaded
+from camtorch.native.structs import (
+    BICUBIC,
+    BILINEAR,
+    BOOL,
+    BORDER,
+    BYTES1,
+    BYTES2,
+    BYTES4,
+    BYTES8,
+    FLOAT32,
+    NEAREST,
+    REFLECTION,
+    SCRATCH,
+    UINT8,
+    UINT16,
+    ZEROS,
+    Classification,
+    Job,
+)
 from camtorch.values.dtypes import as_pixels
 from camtorch.values.threads import spread, thread_count
 
-DOUBT, EMPTY, CUBIC, TODO = -4, -2, -1, 0
-"""Cells of a lattice: whose cubics may miss, showing nothing, between whose nodes lie cubics, wanting positions."""
-
-_MODES = {"nearest": 0, "bilinear": 1, "bicubic": 2}
-PADDINGS = {"zeros": 0, "border": 1, "reflection": 2}
-_TYPES = {torch.uint8: 0, torch.bool: 1, torch.uint16: 2, torch.float32: 3}
-_BYTES = {1: 4, 2: 5, 4: 6, 8: 7}
+_MODES = {"nearest": NEAREST, "bilinear": BILINEAR, "bicubic": BICUBIC}
+PADDINGS = {"zeros": ZEROS, "border": BORDER, "reflection": REFLECTION}
+_TYPES = {torch.uint8: UINT8, torch.bool: BOOL, torch.uint16: UINT16, torch.float32: FLOAT32}
+_BYTES = {1: BYTES1, 2: BYTES2, 4: BYTES4, 8: BYTES8}
 _TILE = 1 << 15  # pixels of a tile, some 0.1 ms a channel
-_packed = struct.Struct("35q4iq").pack  # `Job` of sampler.h
-_Job = ctypes.c_int64 * (struct.calcsize("35q4iq") // 8)
-CLASSIFICATION = "12q3di2q"
-"""`Classification` of sampler.h."""
-_Classification = struct.Struct(CLASSIFICATION).pack
-SCRATCH = 25  # numbers of float32 for each column of a lattice and eight more
 _WORTH = 8  # pixels that may be copied for one that is made: interpolated one by one they would take longer
 
 
@@ -46,8 +54,8 @@ class Call:
     integers are those of integer images. `grid` (B or 1, h, w, 2) of float32 or float64 has positions as of
     `grid_sample`, and `mapped` (B or 1, h, w) bool marks those that exist; None: positions far outside mark that none
     exists. `nodes` (B or 1, 2, n + 5, m + 5) of a lattice, float32, the last two dims without gaps, are the positions
-    at every eighth pixel, from the one at (-16, -16) on; `cells` (B or 1, n, m) int32, contiguous, are `EMPTY`, `CUBIC`
-    or the cell's place in `exact`, (2, K, 8, 8) of float32, contiguous: positions, NaN where there is none.
+    at every eighth pixel, from the one at (-16, -16) on; `cells` (B or 1, n, m) int32, contiguous, are `CELL_EMPTY`,
+    `CELL_CUBIC` or a place in `exact`, (2, K, 8, 8) of float32, contiguous: positions, NaN where there is none.
     """
 
     def __init__(
@@ -75,27 +83,22 @@ class Call:
             self._layout = torch.channels_last if together else torch.contiguous_format
             self._is_copied = not together and result.stride(3) != 1
             result = torch.empty(result.shape, dtype=result.dtype, device="cpu") if self._is_copied else result
-            images = self._copied(images)
-        on_grid, on_lattice, masks = [0] * 6, [0] * 9, [0] * 2
-        if grid is not None:
-            on_grid = [grid.data_ptr(), _shared(grid), *grid.stride()[1:], grid.dtype == torch.float64]
-            if mapped is not None:
-                mapped = mapped.contiguous()
-                masks = [mapped.data_ptr(), _shared(mapped)]
-        if nodes is not None and cells is not None and exact is not None:
-            (_, rows, columns), at = cells.shape, (exact.data_ptr(), exact.stride(0)) if exact.shape[1] else (0, 0)
-            on_lattice = [nodes.data_ptr(), _shared(nodes), nodes.stride(1), cells.data_ptr(), _shared(cells)]
-            on_lattice += [rows, columns, *at]
+            images = _copied(images, self._layout)
         self._tiles = 0 if 0 in result.shape else tiles_of(result)
-        if self._tiles:
-            text, kept = packed(images, result, mode, padding, fill, (*on_grid, *masks, *on_lattice))
-            self._words = _Job.from_buffer_copy(text)
-            self._holds = grid, mapped, nodes, cells, exact, kept
-
-    def _copied(self, images: Tensor) -> Tensor:
-        source = images if images.stride(0) else images[:1]  # which all results show
-        assert self._layout is not None
-        return source.clone(memory_format=self._layout).expand(images.shape)
+        if not self._tiles:
+            return
+        job = self._job = Job()
+        describe(job, images, result, mode, padding, fill)
+        if grid is not None:
+            job.grid, job.grid_is_double = job.keep(grid), grid.dtype == torch.float64
+            job.grid_strides[:] = _shared(grid), *grid.stride()[1:]
+            if mapped is not None:
+                job.mapped, job.mapped_stride = job.keep(mapped.contiguous()), _shared(mapped)
+        if nodes is not None and cells is not None and exact is not None:
+            job.nodes, job.node_strides[:] = job.keep(nodes), (_shared(nodes), nodes.stride(1))
+            job.cells, job.cell_stride, (_, job.rows, job.columns) = job.keep(cells), _shared(cells), cells.shape
+            if exact.shape[1]:
+                job.exact, job.exact_stride = job.keep(exact), exact.stride(0)
 
     def __call__(self, images: Tensor, out: Tensor | None = None) -> Tensor:
         """Return the samples of images, written to `out` if given; that lies in memory as it did at first."""
@@ -103,12 +106,11 @@ class Call:
         if not self._tiles:
             return result
         if self._layout is not None:
-            images = self._copied(images)
+            images = _copied(images, self._layout)
         made = torch.empty(result.shape, dtype=result.dtype, device="cpu") if self._is_copied else result
-        job = _Job.from_buffer_copy(self._words)  # of this call alone, for several threads may be calling
-        job[0], job[1] = images.data_ptr(), made.data_ptr()
-        native, threads = library(), min(thread_count(), self._tiles)
-        assert native is not None  # who made the call has looked
+        job = Job.from_buffer_copy(self._job)  # of this call alone, for several threads may be calling
+        job.source, job.result = images.data_ptr(), made.data_ptr()
+        native, threads = loaded(), min(thread_count(), self._tiles)
         if threads == 1:
             native.camtorch_sample(job)
         else:
@@ -116,17 +118,19 @@ class Call:
         return result if made is result else result.copy_(made)
 
 
-def packed(
-    images: Tensor, result: Tensor, mode: str, padding: str, fill: Sequence[float], positions: Sequence[int]
-) -> tuple[bytes, object]:
-    """Return `Job` of sampler.h, and the objects that must live as long, of arguments of `sample` and positions."""
-    fills = _fills(tuple(fill), images.dtype)
-    kind = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
-    count, channels, height, width = result.shape
-    sizes = count, channels, *images.shape[-2:], height, width
-    places = images.data_ptr(), result.data_ptr(), *images.stride(), *result.stride()
-    how = kind, _MODES[mode], PADDINGS[padding], _tile_rows(width), 0
-    return _packed(*places, *sizes, *fills[:2], *positions, *how), fills
+def _copied(images: Tensor, layout: torch.memory_format) -> Tensor:
+    source = images if images.stride(0) else images[:1]  # which all results show
+    return source.clone(memory_format=layout).expand(images.shape)
+
+
+def describe(job: Job, images: Tensor, result: Tensor, mode: str, padding: str, fill: Sequence[float]) -> None:
+    """Write into a job what arguments of `Call` have in common: all but images and positions."""
+    job.source_strides[:], job.result_strides[:] = images.stride(), result.stride()
+    job.count, job.channels, job.height, job.width = result.shape
+    job.source_height, job.source_width = images.shape[-2:]
+    job.fill, job.fill_elements = map(job.keep, _fills(tuple(fill), images.dtype))
+    job.type = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
+    job.mode, job.padding, job.tile_rows = _MODES[mode], PADDINGS[padding], _tile_rows(result.shape[3])
 
 
 def _tile_rows(width: int) -> int:
@@ -160,11 +164,9 @@ def _shared(tensor: Tensor) -> int:
 
 
 @functools.lru_cache(maxsize=64)
-def _fills(fill: tuple[float, ...], dtype: torch.dtype) -> tuple[int, int, Tensor, Tensor]:
-    """Return the addresses of values in float32 and as pixels (rounded, in range), and their owners."""
-    values = torch.tensor(fill, dtype=torch.float32, device="cpu")
-    elements = as_pixels(fill, dtype)
-    return values.data_ptr(), elements.data_ptr(), values, elements
+def _fills(fill: tuple[float, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Return values in float32 and as pixels (rounded, in range)."""
+    return torch.tensor(fill, dtype=torch.float32, device="cpu"), as_pixels(fill, dtype)
 
 
 def layout(images: Tensor) -> torch.memory_format:
@@ -191,16 +193,19 @@ def classify(
     tolerance: float,
     padding: str,
 ) -> tuple[Tensor, int]:
-    """Return which cells (B, n, m) of a lattice are `EMPTY`, `CUBIC`, `DOUBT` or `TODO`; and the most open of an image.
+    """Return the kinds of cells (B, n, m) of a lattice, `CELL_EMPTY` and so on; and the most open ones of an image.
 
     Positions are `nodes` (B, 2, n + 5, m + 5) of float32 and `mapped` (B, n + 5, m + 5) bool, the last two dims without
     gaps; `rim` (B, 2 (w + h)) bool, contiguous: the target's top row, bottom row, left column and right column.
     """
-    native = library()
-    assert native is not None  # who calls has looked
     count, rows, columns = nodes.shape[0], nodes.shape[2] - 5, nodes.shape[3] - 5
     cells = torch.empty(count, rows, columns, dtype=torch.int32, device="cpu")
     scratch = torch.empty(SCRATCH * (columns + 8), dtype=torch.float32, device="cpu")
-    places = *nodes.stride()[:2], mapped.data_ptr(), mapped.stride(0), rim.data_ptr(), rim.stride(0)
-    asked = (nodes.data_ptr(), *places, count, rows, columns, *size, *source, tolerance, PADDINGS[padding])
-    return cells, native.camtorch_classify(_Classification(*asked, cells.data_ptr(), scratch.data_ptr()))
+    asked = Classification()
+    asked.nodes, asked.mapped, asked.rim, asked.cells, asked.scratch = (
+        tensor.data_ptr() for tensor in (nodes, mapped, rim, cells, scratch)
+    )
+    asked.node_strides[:], asked.mapped_stride, asked.rim_stride = nodes.stride()[:2], mapped.stride(0), rim.stride(0)
+    asked.count, asked.rows, asked.columns, (asked.height, asked.width) = count, rows, columns, size
+    (asked.source_height, asked.source_width), asked.tolerance, asked.padding = source, tolerance, PADDINGS[padding]
+    return cells, loaded().camtorch_classify(asked)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.export import as_constant, is_portable_export, times
+from camtorch.native.structs import INVERTED
 from camtorch.optics.charts import Chart, Equidistant, Planes3, even_steps_and_ratios
 from camtorch.optics.radial import RadialFactor
 from camtorch.optics.radial_inverse import RadialInverse
@@ -23,7 +24,7 @@ class Inverted(Chart):
     Rays are covered before theta stops ascending, and up to `FURTHEST`.
     """
 
-    code: ClassVar[int | None] = 6
+    code: ClassVar[int | None] = INVERTED
 
     def __init__(self, factor: type[RadialFactor], parameters: Sequence[Tensor]):
         """Make the chart from the class of R, whose instances are made of the parameters."""

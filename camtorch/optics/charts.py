@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.export import atan2, plus
+from camtorch.native.structs import CYLINDER, EQUIDISTANT, EQUISOLID, FOV, ONE_DIVISION, PERSPECTIVE, SPHERE
 from camtorch.optics.special import angle_per_radius, cos_root, sinc_root, tanc_root
 
 Planes2 = tuple[Tensor, Tensor]
@@ -42,7 +43,7 @@ class Chart:
     """
 
     code: ClassVar[int | None] = None
-    """The code in native/geometry.h, which a class states for itself, not for subclasses. None: only Python has it."""
+    """The code in native/structs.py, which a class states for itself, not for subclasses. None: only Python has it."""
     has_scale = True
     """Whether the plane point is (x, y) times a `scale`."""
 
@@ -112,7 +113,7 @@ class Perspective(Chart):
     Rays within `1 / end` of 90 degrees are left out: the ninth power of the radius, as in distortions, overflows there.
     """
 
-    code: ClassVar[int | None] = 0
+    code: ClassVar[int | None] = PERSPECTIVE
 
     def end(self, dtype: torch.dtype) -> float:
         return min(1e9, math.pow(torch.finfo(dtype).max, 1 / 9))
@@ -140,7 +141,7 @@ class Perspective(Chart):
 class Equidistant(Chart):
     """theta (cos phi, sin phi), theta = atan2(hypot(x, y), z): covers every ray but the exact backward one."""
 
-    code: ClassVar[int | None] = 1
+    code: ClassVar[int | None] = EQUIDISTANT
 
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         # closer to the backward direction the derivative pi / rho leaves the floating-point range
@@ -168,7 +169,7 @@ class Equidistant(Chart):
 class EquidistantUpTo(Equidistant):
     """The equidistant chart of a lens that is known up to some angle."""
 
-    code: ClassVar[int | None] = 1
+    code: ClassVar[int | None] = EQUIDISTANT
 
     last: Tensor
 
@@ -187,7 +188,7 @@ def _half_turn(dtype: torch.dtype) -> float:
 class CylinderChart(Chart):
     """(longitude, height) = (atan2(x, z), y / hypot(x, z)): covers every ray but straight up and down."""
 
-    code: ClassVar[int | None] = 7
+    code: ClassVar[int | None] = CYLINDER
 
     has_scale = False
 
@@ -207,7 +208,7 @@ class CylinderChart(Chart):
 class SphereChart(Chart):
     """(longitude, latitude) = (atan2(x, z), atan2(y, hypot(x, z))): covers every ray but straight up and down."""
 
-    code: ClassVar[int | None] = 8
+    code: ClassVar[int | None] = SPHERE
 
     has_scale = False
 
@@ -257,7 +258,7 @@ def _sum(z: Tensor, root: Tensor, difference: Tensor) -> Tensor:
 class Equisolid(Chart):
     """2 sin(theta / 2) (cos phi, sin phi): covers every ray but the exact backward one."""
 
-    code: ClassVar[int | None] = 2
+    code: ClassVar[int | None] = EQUISOLID
 
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         return Equidistant().margin(x, y, z)
@@ -286,7 +287,7 @@ class Fov(Chart):
     It is even and analytic in omega, which lies between -pi and pi.
     """
 
-    code: ClassVar[int | None] = 4
+    code: ClassVar[int | None] = FOV
 
     def __init__(self, omega: Tensor):
         self.parameters: tuple[Tensor, ...] = (omega,)
@@ -324,7 +325,7 @@ class Fov(Chart):
 class OneDivision(Chart):
     """The rays (a, b, 1 + coefficient r^2): all but the exact backward one for a negative coefficient."""
 
-    code: ClassVar[int | None] = 5
+    code: ClassVar[int | None] = ONE_DIVISION
 
     def __init__(self, coefficient: Tensor):
         self.parameters: tuple[Tensor, ...] = (coefficient,)

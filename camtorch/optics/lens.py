@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from camtorch.native.structs import HOMOGRAPHY, PLANAR, SHEAR
 from camtorch.optics.charts import Planes2, Planes3
 from camtorch.optics.derivatives import jacobian_of
 from camtorch.optics.radial import RadialFactor
@@ -90,7 +91,7 @@ class Stage:
     The formula reads them here, and nothing else depends on the coefficients.
     """
     code: ClassVar[int | None] = None
-    """The code in native/geometry.h, which a class states for itself, not for subclasses. None: only Python has it."""
+    """The code in native/structs.py, which a class states for itself, not for subclasses. None: only Python has it."""
     _at: ClassVar[type[StageAt]] = StageAt
     radial: RadialFactor | None = None
     """The factor of a first stage that is tabulated, to start the inverse from."""
@@ -142,7 +143,7 @@ class Planar(Stage):
     prism: (s0, s1, s2, s3), the thin-prism coefficients.
     """
 
-    code: ClassVar[int | None] = 16
+    code: ClassVar[int | None] = PLANAR
 
     radial: RadialFactor | None = None
     tangential: Sequence[Tensor] = ()
@@ -270,7 +271,7 @@ class HomographyAt(StageAt):
 class Homography(Stage):
     """The projective map of a matrix, given row by row: (a, b, 1) becomes (x, y, w), and the point x / w, y / w."""
 
-    code: ClassVar[int | None] = 17
+    code: ClassVar[int | None] = HOMOGRAPHY
     _at = HomographyAt
 
     def __init__(self, *matrix: Tensor):
@@ -310,7 +311,7 @@ class Tilt(Homography):
     back along the optical axis, [[R22, 0, -R02], [0, R22, -R12], [0, 0, 1]] R; OpenCV's R_x, R_y turn clockwise.
     """
 
-    code: ClassVar[int | None] = 17
+    code: ClassVar[int | None] = HOMOGRAPHY
 
     def __init__(self, tau_x: Tensor, tau_y: Tensor):
         cx, sx, cy, sy = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
@@ -330,7 +331,7 @@ class ShearAt(StageAt):
 class Shear(Stage):
     """(x + e y, d x + y): a sensor that is not aligned with the lens."""
 
-    code: ClassVar[int | None] = 18
+    code: ClassVar[int | None] = SHEAR
     _at = ShearAt
     is_affine = True
 

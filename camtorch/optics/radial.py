@@ -11,6 +11,7 @@ from torch import Tensor
 
 from camtorch.evaluate.export import pick, piece_of, plus, solve_tridiagonal, unbound
 from camtorch.evaluate.recorded import register
+from camtorch.native.structs import ANGLE_PER_RADIUS, POLYNOMIAL, RADIUS_POLYNOMIAL, RADIUS_TABLE, RATIONAL
 from camtorch.optics.derivatives import derivatives_of
 from camtorch.optics.special import angle_per_radius, first_root, root
 
@@ -22,7 +23,7 @@ class RadialFactor:
     """
 
     code: ClassVar[int | None] = None
-    """The code in native/geometry.h, which a class states for itself, not for subclasses. None: only Python has it."""
+    """The code in native/structs.py, which a class states for itself, not for subclasses. None: only Python has it."""
     name: str
     """The name of the class in the registry."""
     parameters: tuple[Tensor, ...]
@@ -72,7 +73,7 @@ class RadialFactor:
 class Polynomial(RadialFactor):
     """The radial factor R(t) = 1 + c0 t + c1 t^2 + ... of t = radius^2; radius R(t) is the distorted radius."""
 
-    code: ClassVar[int | None] = 1
+    code: ClassVar[int | None] = POLYNOMIAL
 
     def __call__(self, t: Tensor) -> Tensor:
         return self.derivatives(t, 0)[0]
@@ -106,7 +107,7 @@ class Polynomial(RadialFactor):
 class Rational(RadialFactor):
     """The radial factor R(t) = N(t) / D(t), both `Polynomial`, defined before the first zero of D."""
 
-    code: ClassVar[int | None] = 2
+    code: ClassVar[int | None] = RATIONAL
 
     numerator: Polynomial
     denominator: Polynomial
@@ -150,7 +151,7 @@ class RadiusPolynomial(RadialFactor):
     on the direction from which the centre is approached. The derivative returned there is their mean, zero.
     """
 
-    code: ClassVar[int | None] = 3
+    code: ClassVar[int | None] = RADIUS_POLYNOMIAL
 
     of_radius: Polynomial
 
@@ -180,7 +181,7 @@ class RadiusPolynomial(RadialFactor):
 class AnglePerRadius(RadialFactor):
     """The radial factor theta / r of the ray (r, 0, D), D = 1 + c0 t + c1 t^2 + ... of t = r^2."""
 
-    code: ClassVar[int | None] = 4
+    code: ClassVar[int | None] = ANGLE_PER_RADIUS
 
     def __init__(self, coefficients: Sequence[Tensor]):
         self.ahead: RadialFactor = Polynomial(coefficients)
@@ -216,7 +217,7 @@ class RadiusTable(RadialFactor):
     so that the lens folds there.
     """
 
-    code: ClassVar[int | None] = 6
+    code: ClassVar[int | None] = RADIUS_TABLE
 
     nodes: tuple[Tensor, ...]
     end: Tensor

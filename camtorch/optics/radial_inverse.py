@@ -13,6 +13,7 @@ from camtorch.evaluate.export import as_index, is_portable_export, of_points, re
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_known
 from camtorch.evaluate.recorded import CLASSES
+from camtorch.native.structs import NODES
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.values.arguments import columns
 
@@ -21,8 +22,7 @@ if TYPE_CHECKING:
 
 RADII = 1024  # at which a factor is followed to its fold
 _PARTS = 256  # of the interval with a fold, divided twice before the secant
-_NODES = 1024  # of the table of an inverse
-TABLE_WIDTH = 2 + 2 * _NODES  # columns of `tabulate`
+TABLE_WIDTH = 2 + 2 * NODES  # columns of `tabulate`
 _LIMITING = 16  # roots of a radius, to one whose image is a number
 _HALF_WAY = 2.0  # the squared radius in the middle of the table of a lens that never folds
 MOST_STEPS = 5  # of Newton's method; slower methods finish what still moves
@@ -118,14 +118,14 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
 def tabulate(radial: RadialFactor, fold: Tensor, usual_end: float | Tensor) -> Tensor:
     """Return the table (C, 2 + 2 nodes) of an `InverseTable`."""
     end = fold.clamp(max=usual_end)
-    u = torch.linspace(0, 1, _NODES + 1, dtype=fold.dtype, device=fold.device)
+    u = torch.linspace(0, 1, NODES + 1, dtype=fold.dtype, device=fold.device)
     square = _square(u, end * end)
     factor = radial(square)
     r2 = (square * factor * factor).cummax(-1).values
     reach2 = r2[..., -1:]
     # the places of the nodes' images, and the values at nodes that are even there
     at = _variable(r2, reach2)
-    cell = (torch.searchsorted(at, u.expand_as(at).contiguous(), right=True) - 1).clamp(0, _NODES - 1)
+    cell = (torch.searchsorted(at, u.expand_as(at).contiguous(), right=True) - 1).clamp(0, NODES - 1)
     low, high = at.gather(-1, cell), at.gather(-1, cell + 1)
     scale = factor.reciprocal()
     before, step = scale.gather(-1, cell), scale.diff(dim=-1).gather(-1, cell)
@@ -162,16 +162,16 @@ class InverseTable:
     def __init__(self, table: Tensor, *, is_constant: bool = False):
         """Split a `table` of `tabulate` into its parts, which are no views if `is_constant`."""
         self.is_constant = is_constant
-        parts = table[..., :1], table[..., 1:2], table[..., 2 : 2 + _NODES], table[..., 2 + _NODES :]
+        parts = table[..., :1], table[..., 1:2], table[..., 2 : 2 + NODES], table[..., 2 + NODES :]
         self.reach2, self.most2, self.values, self.steps = (p.clone() for p in parts) if is_constant else parts
 
     def __call__(self, r2: Tensor) -> Tensor:
         """Return the factor for (C, N), accurate to about 1e-6."""
-        position = _variable(r2, self.reach2) * _NODES
-        node = as_index(position).clamp(0, _NODES - 1)
+        position = _variable(r2, self.reach2) * NODES
+        node = as_index(position).clamp(0, NODES - 1)
         fraction = position - node
         if self.values.shape[0] > 1:
-            node = node + torch.arange(self.values.shape[0], device=r2.device, dtype=node.dtype).unsqueeze(-1) * _NODES
+            node = node + torch.arange(self.values.shape[0], device=r2.device, dtype=node.dtype).unsqueeze(-1) * NODES
         node = node.flatten()
         value, step = self.values.flatten().index_select(0, node), self.steps.flatten().index_select(0, node)
         return torch.addcmul(value.view(r2.shape), fraction, step.view(r2.shape))

@@ -12,6 +12,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from camtorch.native.structs import SURFACE
 from camtorch.optics.charts import Planes2
 from camtorch.optics.lens import Jacobian, Stage, StageAt
 
@@ -99,7 +100,7 @@ class Surface(Stage):
         behind: Cells past its edge that belong to it.
     """
 
-    code: ClassVar[int | None] = 19
+    code: ClassVar[int | None] = SURFACE
     _at = SurfaceAt
 
     columns: int

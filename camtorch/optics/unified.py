@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from camtorch.native.structs import UNIFIED
 from camtorch.optics.charts import Chart, Perspective, Planes3, even_steps_and_ratios, unit
 
 
@@ -21,7 +22,7 @@ class Unified(Chart):
     out is 0, 0 and 1, which is the perspective chart; a number is a part that does not learn.
     """
 
-    code: ClassVar[int | None] = 3
+    code: ClassVar[int | None] = UNIFIED
 
     fixed_alpha: float | None
     has_xi: bool

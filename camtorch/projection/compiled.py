@@ -4,31 +4,39 @@ from __future__ import annotations
 
 import functools
 import operator
-import struct
 import threading
 from collections.abc import Callable
 from ctypes import Array, addressof, c_int64
 from itertools import accumulate
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from camtorch.native import memory
-from camtorch.native.sampler import CLASSIFICATION, PADDINGS, SCRATCH
-from camtorch.projection.native_cameras import Native, address, entry
+from camtorch.native import memory, structs
+from camtorch.native.library import loaded
+from camtorch.native.sampler import PADDINGS
+from camtorch.native.structs import (
+    LEFT_FROM,
+    LEFT_TO,
+    POSITIONS,
+    PROJECT,
+    PROJECT_VJP,
+    SCRATCH,
+    SQUARES,
+    STEP,
+    UNPROJECT,
+    UNPROJECT_VJP,
+    Job,
+    Move,
+    Rows,
+)
+from camtorch.projection.native_cameras import Native, address
 from camtorch.values.threads import spread, thread_count
 
-PROJECT, UNPROJECT, PROJECT_VJP, UNPROJECT_VJP = range(4)
+_Call = TypeVar("_Call")
 _TILE = 1 << 14  # points of a tile, some 30 us
 _SHARED = 1 << 15  # points that threads are woken for
-_Rows = struct.Struct("20q").pack  # `Rows` of geometry.h
-packed_move: Callable[..., bytes] = struct.Struct("8q2d12q").pack  # `Move` of geometry.h
-_LATTICES = struct.Struct(f"8q2d12q{CLASSIFICATION}6q")  # `Lattices`
-LATTICE_WORDS = _LATTICES.size // 8
-POSITIONS, PIXELS, ON_IMAGE, BOXES = range(4)
-LEFT_FROM, LEFT_TO, LEFT_MOST, LEFT_LABELS = 1, 2, 4, 4
-_NO_ROWS = (0, 0, 0, 0)
 
 
 def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -36,8 +44,10 @@ def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     cameras, count, _ = points.shape
     pixels = _empty((2, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
-    places = points.data_ptr(), *points.stride(), pixels.data_ptr(), count, 1, cameras * count, valid.data_ptr()
-    _call_and_follow(native, cameras, count, PROJECT, (*places, 0, *_NO_ROWS, 0))
+    call = Rows()
+    call.rows, call.row_strides[:], call.valid = points.data_ptr(), points.stride(), valid.data_ptr()
+    call.results, call.result_strides[:] = pixels.data_ptr(), (count, 1, cameras * count)
+    _call_and_follow(native, cameras, count, PROJECT, call)
     return pixels, valid
 
 
@@ -56,8 +66,11 @@ def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojecte
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
     solution = _empty((2, cameras, count), native.dtype) if keeps else None
     native.add_table()
-    rows = pixels.data_ptr(), *pixels.stride(), rays.data_ptr(), count, 1, cameras * count, valid.data_ptr()
-    _call_and_follow(native, cameras, count, UNPROJECT, (*rows, address(solution), *_NO_ROWS, 0))
+    call = Rows()
+    call.rows, call.row_strides[:], call.valid = pixels.data_ptr(), pixels.stride(), valid.data_ptr()
+    call.results, call.result_strides[:] = rays.data_ptr(), (count, 1, cameras * count)
+    call.solution = address(solution)
+    _call_and_follow(native, cameras, count, UNPROJECT, call)
     return Unprojected(rays, valid, solution)
 
 
@@ -68,9 +81,9 @@ def project_vjp(
 
     `cotangents` are those of pixels, (2, C, N), of any strides.
     """
-    assert cotangents.shape[1:] == points.shape[:2]  # C would read elsewhere otherwise
-    given = points.data_ptr(), *points.stride(), 0, 0
-    return _vjp(native, PROJECT_VJP, given, cotangents, 3 * want_points, want_parameters)
+    call = Rows()
+    call.rows, call.row_strides[:] = points.data_ptr(), points.stride()
+    return _vjp(native, PROJECT_VJP, call, points.shape[:2], cotangents, 3 * want_points, want_parameters)
 
 
 def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[Tensor, Tensor]:
@@ -83,8 +96,12 @@ def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[
     sums = torch.zeros(2, cameras, count, (4 + native.parameters) * by_camera, dtype=torch.float64, device="cpu")
     tile = 1 if by_camera else _TILE
     for one, by, to in zip(torch.eye(2, dtype=native.dtype, device="cpu"), by_points, sums, strict=True):
-        given = points.data_ptr(), *points.stride(), by.data_ptr(), *by.stride(), 0, 0, one.data_ptr(), 0, 0, 1
-        _call(native, cameras, count, PROJECT_VJP, (*given, to.data_ptr() if by_camera else 0), tile)
+        call = Rows()
+        call.rows, call.row_strides[:] = points.data_ptr(), points.stride()
+        call.results, call.result_strides[:] = by.data_ptr(), by.stride()
+        call.cotangents, call.cotangent_strides[:] = one.data_ptr(), (0, 0, 1)
+        call.sums = to.data_ptr() if by_camera else None
+        _call(native, cameras, count, PROJECT_VJP, call, tile)
     return by_points.movedim(0, 2), sums.movedim(0, 2)
 
 
@@ -92,24 +109,33 @@ def unproject_vjp(
     native: Native, valid: Tensor, solution: Tensor, cotangents: Tensor, want_pixels: bool, want_parameters: bool
 ) -> tuple[Tensor | None, Tensor | None]:
     """Return the cotangents of pixels (C, N, 2), and of the cameras, for results of `unproject`; see `project_vjp`."""
-    assert cotangents.shape[1:] == valid.shape  # C would read elsewhere otherwise
-    given = *_NO_ROWS, valid.data_ptr(), solution.data_ptr()
-    return _vjp(native, UNPROJECT_VJP, given, cotangents, 2 * want_pixels, want_parameters)
+    call = Rows()
+    call.valid, call.solution = valid.data_ptr(), solution.data_ptr()
+    return _vjp(native, UNPROJECT_VJP, call, valid.shape, cotangents, 2 * want_pixels, want_parameters)
 
 
 def _vjp(
-    native: Native, direction: int, given: tuple[int, ...], cotangents: Tensor, size: int, want_parameters: bool
+    native: Native,
+    direction: int,
+    call: Rows,
+    shape: torch.Size,
+    cotangents: Tensor,
+    size: int,
+    want_parameters: bool,
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Return the cotangents of rows (C, N, size), None if the size is 0, and of the cameras, None if not wanted."""
-    _, cameras, count = cotangents.shape
+    """Return the cotangents of rows (*shape, size), None if the size is 0, and of the cameras, None if not wanted."""
+    if cotangents.shape[1:] != shape:  # C would read elsewhere
+        raise ValueError(f"cotangents must be of {tuple(shape)} rows; got {tuple(cotangents.shape[1:])}")
+    cameras, count = shape
     results = _empty((cameras, count, size), native.dtype) if size else None
     tiles, sums = -(-count // _TILE), None
     if want_parameters:
         sums = torch.zeros(cameras, tiles, 4 + native.parameters, dtype=torch.float64, device="cpu")
-    places = _NO_ROWS if results is None else (results.data_ptr(), *results.stride())
-    component, camera, point = cotangents.stride()
-    by = cotangents.data_ptr(), camera, point, component, address(sums)
-    _call(native, cameras, count, direction, (*given[:4], *places, *given[4:], *by))
+    if results is not None:
+        call.results, call.result_strides[:] = results.data_ptr(), results.stride()
+    component, *row = cotangents.stride()
+    call.cotangents, call.cotangent_strides[:], call.sums = cotangents.data_ptr(), (*row, component), address(sums)
+    _call(native, cameras, count, direction, call)
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
@@ -117,8 +143,8 @@ class Lattices:
     """Lattices of cameras (C,), from probes (1, N, 2) at their nodes and at the rim: `Lattices` of geometry.h.
 
     See `warp.grid.on_lattice`. size: (h, w) of the target. tolerance: in pixels of the source, which has images of
-    `source_size`. given: both cameras and the turns, as in `Move`. room: returns memory of so many bytes. Images
-    sampled in the same call find the lattices at `places`, the fields of `Job` of sampler.h.
+    `source_size`. move: both cameras and the turns. room: returns memory of so many bytes. `lay` has images find the
+    lattices that are sampled in the same call.
     """
 
     def __init__(
@@ -130,34 +156,53 @@ class Lattices:
         padding: str,
         cameras: int,
         first_row: int = 0,
-        given: tuple[int, ...] = (0, 0, 0, 0, 1, 3),
+        move: Move | None = None,
         room: Callable[[int], Tensor] = lambda count: torch.empty(count, dtype=torch.uint8, device="cpu"),
     ):
         dtype, count, is_double = probes.dtype, probes.shape[1], probes.dtype == torch.float64
-        n, m = (-(-side // 8) for side in size)
+        n, m = (-(-side // STEP) for side in size)
         nodes, self._most = (n + 5) * (m + 5), cameras * n * m
         # the first (n + 5) (m + 5) nodes are those of the lattice, the others are on the rim
         self.nodes = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
         self.cells = torch.empty(cameras, n, m, dtype=torch.int32, device="cpu")
         # exact positions, of which parts are written; nodes in float32; scratch; valid flags of the probes
-        sizes = 128 * self._most * dtype.itemsize, 8 * cameras * nodes * is_double, 4 * SCRATCH * cameras * (m + 8)
-        self._room, self._probes, self.counters = room(sum(sizes) + cameras * count), probes, (c_int64 * 2)()
+        squares = 2 * SQUARES * self._most
+        sizes = squares * dtype.itemsize, 8 * cameras * nodes * is_double, 4 * SCRATCH * cameras * (m + 8)
+        self._room, self.counters = room(sum(sizes) + cameras * count), (c_int64 * 2)()
         exact, narrow, scratch, valid = accumulate(sizes, initial=self._room.data_ptr())
-        at, cells, used = self.nodes.data_ptr(), self.cells.data_ptr(), addressof(self.counters)
-        rows = *rows_of(probes), at, 2 * count, 1, count, valid, count, count, used
-        asked = at, 2 * count, count, valid, count, valid + nodes, count, cameras, n, m, *size
-        how = *source_size, tolerance, PADDINGS[padding], cells, scratch
-        more = first_row, narrow if is_double else 0, exact, used + 8, 0, 0
-        move = *given, cameras, POSITIONS, *source_size, *rows
-        self.words: bytes = _LATTICES.pack(*move, *asked, *how, *more)
-        in_float = (narrow, 2 * nodes, nodes) if is_double else (at, 2 * count, count)
-        self.places = *in_float, cells, n * m, n, m, exact, 64 * self._most * (1 + is_double)
+        made, (next_camera, used) = structs.Lattices(), (addressof(self.counters) + 8 * i for i in range(2))
+        made.first_row, made.narrow, made.exact, made.used = first_row, narrow if is_double else None, exact, used
+        if move is None:
+            made.move.turn_strides[:] = 0, 1, 3
+        else:
+            made.move = move
+        move, cells = made.move, made.cells
+        move.cameras, move.form, (move.height, move.width) = cameras, POSITIONS, source_size
+        made.keep(probes)
+        move.rows, move.row_strides[:] = rows_of(probes)
+        move.results, move.result_strides[:], move.valid = self.nodes.data_ptr(), (2 * count, 1, count), valid
+        move.count, move.tile, move.next = count, count, next_camera
+        cells.nodes, cells.node_strides[:] = move.results, (2 * count, count)
+        cells.mapped, cells.rim, cells.cells, cells.scratch = valid, valid + nodes, self.cells.data_ptr(), scratch
+        cells.mapped_stride, cells.rim_stride, cells.count, cells.rows, cells.columns = count, count, cameras, n, m
+        (cells.height, cells.width), (cells.source_height, cells.source_width) = size, source_size
+        cells.tolerance, cells.padding = tolerance, PADDINGS[padding]
+        self.struct, self._is_double = made, is_double
+
+    def lay(self, job: Job) -> None:
+        """Have images find the lattices, which are in float for them."""
+        made, double, (_, n, m) = self.struct, self._is_double, self.cells.shape
+        plane = (n + 5) * (m + 5)
+        job.nodes = made.narrow if double else made.cells.nodes
+        job.node_strides[:] = (2 * plane, plane) if double else tuple(made.cells.node_strides)
+        job.cells, job.cell_stride, job.rows, job.columns = made.cells.cells, n * m, n, m
+        job.exact, job.exact_stride = made.exact, SQUARES * self._most * (1 + double)
 
     def results(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return `nodes` (C, 2, n + 5, m + 5), `cells`, and `exact` (2, K, 8, 8), NaN if there is no position."""
         (cameras, n, m), dtype, most = self.cells.shape, self.nodes.dtype, self._most
         nodes = self.nodes.as_strided((cameras, 2, n + 5, m + 5), (*self.nodes.stride()[:2], m + 5, 1))
-        exact = self._room[: 128 * most * dtype.itemsize].view(dtype).view(2, most, 8, 8)
+        exact = self._room[: 2 * SQUARES * most * dtype.itemsize].view(dtype).view(2, most, STEP, STEP)
         return nodes, self.cells, exact[:, : self.counters[1]].clone()
 
 
@@ -172,8 +217,9 @@ class Between:
         self.cameras = max(start.cameras, end.cameras, count)
         start.add_table()
         self._size = size
-        by_camera = strides[0] if count > 1 else 0
-        self._given = start.pointer, end.pointer, address(turns), by_camera, *strides[-2:], self.cameras
+        self._move = move = Move()
+        move.from_, move.to, move.turns, move.cameras = start.pointer, end.pointer, address(turns), self.cameras
+        move.turn_strides[:] = strides[0] if count > 1 else 0, *strides[-2:]
 
     def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor]:
         """Return pixels (C, N, 2) of the others for pixels (C or 1, N, 2), and valid (C, N).
@@ -184,30 +230,33 @@ class Between:
         count = pixels.shape[1]
         result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
         valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
-        rows = *rows_of(pixels), result.data_ptr(), 2 * count, 2, 1, valid.data_ptr(), count, _TILE
-        call = packed_move(*self._given, form, *self._size, *rows, addressof(_kept.counters))
-        tiles = -(-count // _TILE) * self.cameras
-        self._run("camtorch_moves", call, tiles if self.cameras * count >= _SHARED else 1, _kept.counters)
+        call, counters = Move.from_buffer_copy(self._move), _kept.counters
+        call.form, (call.height, call.width), call.count, call.tile = form, self._size, count, _TILE
+        call.rows, call.row_strides[:] = rows_of(pixels)
+        call.results, call.result_strides[:], call.valid = result.data_ptr(), (2 * count, 2, 1), valid.data_ptr()
+        call.next = addressof(counters)
+        tiles = -(-count // _TILE) * self.cameras if self.cameras * count >= _SHARED else 1
+        run_and_follow(loaded().camtorch_moves, call, tiles, counters, self._start, self._end)
         return result, valid
 
     def lattices(
         self, probes: Tensor, size: tuple[int, int], first_row: int, tolerance: float, padding: str
     ) -> tuple[Tensor, Tensor, Tensor] | None:
         """Return the results of `Lattices`, or None if most cells would have positions of their own."""
-        given = self._given[:-1]
-        made = Lattices(probes, size, self._size, tolerance, padding, self.cameras, first_row, given, _kept_memory)
-        return None if self._run("camtorch_lattices", made.words, self.cameras, made.counters) else made.results()
-
-    def _run(self, name: str, call: object, tiles: int, counters: Array[c_int64]) -> int:
-        """Return flags of parts that are not made. `counters` are the call's next tile and the number of places."""
-        threads = min(thread_count(), tiles) if tiles > 1 else 1
-        return run_and_follow(entry(name, c_int64), call, threads, counters, self._start, self._end)
+        made = Lattices(probes, size, self._size, tolerance, padding, self.cameras, first_row, self._move, _kept_memory)
+        run, end = loaded().camtorch_lattices, self._end
+        left = run_and_follow(run, made.struct, self.cameras, made.counters, self._start, end)
+        return None if left else made.results()
 
 
 def run_and_follow(
-    run: Callable[[object], int], call: object, threads: int, counters: Array[c_int64], start: Native, end: Native
+    run: Callable[[_Call], int], call: _Call, tiles: int, counters: Array[c_int64], start: Native, end: Native
 ) -> int:
-    """Return flags of the parts that a call leaves undone; if azimuths must be followed first, it is repeated."""
+    """Return flags of the parts that a call leaves undone; if azimuths must be followed first, it is repeated.
+
+    `counters` are the call's next tile and the number of places.
+    """
+    threads = min(thread_count(), tiles) if tiles > 1 else 1
     while True:
         left: list[int] = []
         counters[:] = [0, 0]
@@ -240,10 +289,10 @@ def _kept_memory(count: int) -> Tensor:
     return _kept.memory
 
 
-def rows_of(pixels: Tensor) -> tuple[int, int, int, int]:
+def rows_of(pixels: Tensor) -> tuple[int, tuple[int, int, int]]:
     """Return the address of pixels (C or 1, N, 2), and their strides."""
     camera, point, component = pixels.stride()
-    return pixels.data_ptr(), camera if pixels.shape[0] > 1 else 0, point, component
+    return pixels.data_ptr(), (camera if pixels.shape[0] > 1 else 0, point, component)
 
 
 def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
@@ -253,21 +302,23 @@ def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
     return torch.empty(size, dtype=dtype, device="cpu")
 
 
-def _call(native: Native, cameras: int, count: int, direction: int, rows: tuple[int, ...], tile: int = _TILE) -> int:
-    """Call the compiled geometry with `rows`, the fields of `Rows` between its cameras and its count."""
-    assert cameras == native.cameras
-    run, points = entry("camtorch_geometry", c_int64), cameras * count
+def _call(native: Native, cameras: int, count: int, direction: int, call: Rows, tile: int = _TILE) -> int:
+    """Call the compiled geometry with rows, their results and what belongs to them."""
+    if cameras != native.cameras:  # C would read elsewhere
+        raise ValueError(f"rows must be of {native.cameras} cameras; got those of {cameras}")
+    call.cameras, call.count, call.tile, call.direction = native.pointer, count, tile, direction
+    run, points = loaded().camtorch_geometry, cameras * count
     if points < _SHARED:
-        return run(_Rows(native.pointer, *rows, count, tile, direction, 0)) if points else 0
+        return run(call) if points else 0
     following = c_int64(0)
-    call = _Rows(native.pointer, *rows, count, tile, direction, addressof(following))
+    call.next = addressof(following)
     left: list[int] = []
     spread(lambda: left.append(run(call)), min(thread_count(), -(-count // _TILE) * cameras))
     return sum(left)
 
 
-def _call_and_follow(native: Native, cameras: int, count: int, direction: int, rows: tuple[int, ...]) -> None:
+def _call_and_follow(native: Native, cameras: int, count: int, direction: int, call: Rows) -> None:
     """Call the geometry, and again with the limits of each azimuth if a point lies so far out that they decide."""
-    if _call(native, cameras, count, direction, rows):
+    if _call(native, cameras, count, direction, call):
         native.follow()
-        _call(native, cameras, count, direction, rows)
+        _call(native, cameras, count, direction, call)

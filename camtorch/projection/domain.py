@@ -12,8 +12,9 @@ from torch import Tensor
 from camtorch.evaluate.elsewhere import sent
 from camtorch.evaluate.export import of_points, plus
 from camtorch.evaluate.kept import Kept
+from camtorch.native.structs import AZIMUTHS, MOST_RADII
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
-from camtorch.projection.fold import AZIMUTHS, Extent, azimuth, limits_and_extent
+from camtorch.projection.fold import Extent, azimuth, limits_and_extent
 from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from camtorch.optics.lens import Lens
     from camtorch.optics.model_spec import Optics
 
-_RADII = 512
 _AT_ONCE = 6  # cameras whose azimuths are followed together
 _STEPS = 129
 # Stages after a radial one that change distances by less than a quarter, and so move points by less than that, are
@@ -153,9 +153,9 @@ class Domain:
         if self.lens.is_radial or self.all_stagewise:
             inner = self._fold.to(self.k.dtype)
         else:
-            radii = self.chart.radii(_RADII, self.k)
+            radii = self.chart.radii(MOST_RADII, self.k)
             lost = first_loss(self.lens.lower_bound(radii.expand(self.k.shape[0], -1))[0])
-            inner = radii[(lost - 1).floor().clamp(0, _RADII - 1).long()].unsqueeze(-1)
+            inner = radii[(lost - 1).floor().clamp(0, MOST_RADII - 1).long()].unsqueeze(-1)
             inner = inner if self.stagewise is None else torch.where(self.stagewise, self._fold.to(inner.dtype), inner)
         return within(inner.clamp(max=self.chart.end(inner.dtype)))
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.export import as_index
+from camtorch.native.structs import AZIMUTHS
 from camtorch.optics.radial_inverse import first_loss
 from camtorch.values.arguments import columns
 
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from camtorch.optics.model_spec import Optics
     from camtorch.optics.radial import RadialFactor
 
-AZIMUTHS = 336  # no further apart than 1.4 degrees
 _RADII = 2048  # to find the fold of the radial factor
 _SMOOTH, _BULGE = 0.02, 0.001
 _DIP = 65  # radii at which a dip between two nodes is sampled

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 from collections.abc import Callable, Sequence
-from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
+from ctypes import addressof, c_double
 from typing import TYPE_CHECKING
 
 import torch
@@ -13,7 +13,9 @@ from torch import Tensor
 
 from camtorch import optics
 from camtorch.evaluate.kept import Kept
-from camtorch.native.library import library
+from camtorch.native import structs
+from camtorch.native.library import library, loaded
+from camtorch.native.structs import AZIMUTHS, EXTENT, MOST_DEGREE, MOST_PARTS, MOST_RADII, RADII, Part
 from camtorch.optics.backprojection import FURTHEST
 from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.values.arguments import columns
@@ -25,57 +27,13 @@ if TYPE_CHECKING:
     from camtorch.optics.radial import RadialFactor
     from camtorch.projection.domain import Domain
 
-_MOST_PARTS, _MOST_DEGREE = 5, 64
-_RADII, _FOLLOWED, AZIMUTHS = 512, 80, 336
-EXTENT = _FOLLOWED + AZIMUTHS * (_FOLLOWED + 1)
-
-_HAS_XI, _HAS_ALPHA, _HAS_BETA, _TRANSVERSE = 1, 2, 4, 8
-_TANGENTIAL, _PRISM = 1, 2
-
-
-def fields(text: str, **others: type) -> tuple[tuple[str, type], ...]:
-    """Return the fields of a struct by name: *pointers, numbers of 64 bits, and `others` of their own types."""
-    return tuple((w.lstrip("*"), others.get(w, c_void_p if w[0] == "*" else c_int64)) for w in text.split())
-
-
-class _Part(ctypes.Structure):
-    """`Part` of geometry.h."""
-
-    _fields_ = (
-        *((name, c_int32) for name in ("kind", "flags", "factor", "n", "m")),
-        ("constant", c_double),
-        ("cells", c_double * 2),
-        ("centre", c_double * 2),
-    )
-
-
-class CamerasStruct(ctypes.Structure):
-    """`Cameras` of geometry.h."""
-
-    _fields_ = fields(
-        "*parts part_count is_double cameras *intrinsics *parameters parameter_count *constants constant_count *usable "
-        "*safe_radius_sq *image_radius_sq *limits2 *extent *table *stagewise *image_circle_sq "
-        "*chart_safe_radius_sq *chart_most2 *chart_table"
-    )
-
-
-class DomainStruct(ctypes.Structure):
-    """`Domain` of geometry.h."""
-
-    _fields_ = fields(
-        "*parts part_count is_double cameras *parameters parameter_count *constants constant_count is_chart is_radial "
-        "*ends *usual_ends *folds most *radii *coarse *even *safe_radius_sq *image_radius_sq *image_circle_sq *table "
-        "*limits2 *extent *stagewise",
-        most=c_double,
-    )
-
 
 class Plan:
     """The properties that all cameras of a model and a number of coefficients have in common."""
 
-    def __init__(self, chart: Chart, lens: Lens, parts: Sequence[_Part], coefficients: Sequence[Tensor]):
+    def __init__(self, chart: Chart, lens: Lens, parts: Sequence[Part], coefficients: Sequence[Tensor]):
         """Make the plan of optics whose coefficients are columns, whatever their values."""
-        self.parts, self.count = (_Part * len(parts))(*parts), len(parts)
+        self.parts, self.count = (Part * len(parts))(*parts), len(parts)
         parameters = (*chart.parameters, *lens.parameters)
         self.parameters = len(parameters)
         places = {id(c): i for i, c in enumerate(coefficients)}
@@ -87,7 +45,7 @@ class Plan:
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
         # a radial factor has so many numbers that its fold is not found by a root
-        self.is_long = any(part.factor and part.n + part.m > _MOST_DEGREE for part in parts)
+        self.is_long = any(part.factor and part.n + part.m > MOST_DEGREE for part in parts)
         self.fixed_ends: dict[torch.dtype, tuple[float, float]] = {}  # if all cameras have them, after a call of `ends`
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
@@ -128,14 +86,14 @@ _plans = Kept(64)  # keyed by optics and number of coefficients
 class Lenses:
     """The lenses of cameras (C,) in the form of the compiled geometry: numbers, and their domains as far as known."""
 
-    struct: CamerasStruct
+    struct: structs.Cameras
     """The lenses' part of the struct; pointers that are not set are of values that are not known yet."""
-    _kept: list[object]
 
     def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool = False):
-        self.plan, self._optics_of, self._k, self._kept = plan, optics_of, k, [k]
+        self.plan, self._optics_of, self._k = plan, optics_of, k
         self._slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
-        self.struct = struct = CamerasStruct()
+        self.struct = struct = structs.Cameras()
+        struct.hold(k)
         struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
         struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
         if plan.parameters:
@@ -156,18 +114,19 @@ class Lenses:
     def known(cls, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], made: Native) -> Lenses:
         """Return the lenses of cameras that compiled code made, with their parameters and domains."""
         lenses = cls.__new__(cls)
-        lenses.plan, lenses._optics_of, lenses._k, lenses._kept = plan, optics_of, k, [k, made._kept]
+        lenses.plan, lenses._optics_of, lenses._k = plan, optics_of, k
         lenses._slow_domain, lenses.cameras, lenses.dtype = domain, len(k), k.dtype
-        lenses.struct = CamerasStruct.from_buffer_copy(made.struct)
+        lenses.struct = structs.Cameras.from_buffer_copy(made.struct)
+        lenses.struct.hold(made.struct)
         return lenses
 
     def _optics(self) -> tuple[Chart, Lens]:
         return self._optics_of(columns(self._k.double()))
 
     @functools.cached_property
-    def asked(self) -> DomainStruct:
+    def asked(self) -> structs.Domain:
         """The request for the domain, with optics in double precision."""
-        made, plan = DomainStruct(), self.plan
+        made, plan = structs.Domain(), self.plan
         # they are in double precision if the model computes them
         k = self._k if plan.places is not None else self._k.double()
         parameters = plan.parameters_of(self._optics_of, k) if plan.parameters else k
@@ -182,23 +141,22 @@ class Lenses:
                 made.constants, made.constant_count = self._keep_columns(constants, torch.float64), len(constants)
             factor = chart.factor(chart.parameters) if isinstance(chart, optics.Inverted) else lens.radial
             if factor is not None:
-                many = len(factor.parameters) > _MOST_DEGREE
+                many = len(factor.parameters) > MOST_DEGREE
                 fold = factor.closed_fold() if many and factor.fold is None else factor.fold
                 made.folds = None if fold is None else self._keep(fold.expand(self.cameras, 1))
         return made
 
     def _keep_ends(self, end: float | Tensor) -> int:
         if isinstance(end, float):
-            self._kept.append(ends := _same_ends(end, self.cameras))
-            return addressof(ends)
+            return self.struct.keep(_same_ends(end, self.cameras))
         return self._keep(end.expand(self.cameras, 1).double())
 
     def _ask(self, wanted: dict[str, int]) -> None:
         """Fill in the wanted parts of the domain: names and addresses."""
-        asked = DomainStruct.from_buffer_copy(self.asked)  # several threads may ask at once
+        asked = structs.Domain.from_buffer_copy(self.asked)  # several threads may ask at once
         for name, place in wanted.items():
             setattr(asked, name, place)
-        entry("camtorch_domain", None)(byref(asked))
+        loaded().camtorch_domain(asked)
 
     def _new(self, columns: int) -> int:
         return self._keep(torch.empty(self.cameras, columns, dtype=self.dtype, device="cpu"))
@@ -214,14 +172,14 @@ class Lenses:
         has_table = tables and plan.has_factor  # made now, as pixels will follow
         start, step = self._new(len(names) + TABLE_WIDTH * has_table), self.cameras * self.dtype.itemsize
         wanted = {name: start + step * i for i, name in enumerate([*names, *["table"] * has_table])}
-        radii = {} if plan.is_radial else {"radii": self._keep(plan.radii(lambda: self._optics()[0], _RADII, self._k))}
-        self._ask(wanted | radii)
+        radii = None if plan.is_radial else plan.radii(lambda: self._optics()[0], MOST_RADII, self._k)
+        self._ask(wanted if radii is None else wanted | {"radii": self._keep(radii)})
         for name, place in wanted.items():
             setattr(self.struct, name, place)
 
     def radii_wanted(self) -> dict[str, Tensor]:
         """Return the radii on which lenses are followed, by their names in a request."""
-        names = {"radii": _RADII, "even": _FOLLOWED, "coarse": _FOLLOWED // 2}
+        names = {"radii": MOST_RADII, "even": RADII, "coarse": RADII // 2}
         chart, like = self._optics()[0], self._k.double()
         return {name: self.plan.radii(lambda: chart, count, like) for name, count in names.items()}
 
@@ -233,7 +191,7 @@ class Lenses:
             self.struct.table = table  # set when it is whole, as another thread may be reading
         return int(self.struct.table)
 
-    def followed(self) -> tuple[int, int]:
+    def followed(self) -> tuple[int | None, int | None]:
         """Return the addresses of the limits of each azimuth and of its extent, made if a point lies far out."""
         struct = self.struct
         if struct.limits2 is None:
@@ -263,9 +221,7 @@ class Lenses:
         return made
 
     def _keep(self, tensor: Tensor) -> int:
-        tensor = tensor.contiguous()
-        self._kept.append(tensor)
-        return tensor.data_ptr()
+        return self.struct.keep(tensor.contiguous())
 
     def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype | None = None) -> int:
         return self._keep(torch.cat([c.expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
@@ -290,23 +246,23 @@ def lenses_of(plan: Plan, k: Tensor, make: Callable[[], Lenses]) -> Lenses:
 class Native:
     """Cameras (C,) of one model in the form of the compiled geometry."""
 
-    _kept: object
     _make_lenses: Callable[[Native], Lenses]
 
     def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
-        self.lenses, self.plan, self.struct = lenses, lenses.plan, CamerasStruct.from_buffer_copy(lenses.struct)
-        kept = self._kept = intrinsics.contiguous(), None if usable is None else (usable > 0).contiguous()
+        self.lenses, self.plan, self.struct = lenses, lenses.plan, structs.Cameras.from_buffer_copy(lenses.struct)
         self.cameras, self.dtype, self.parameters = intrinsics.shape[0], intrinsics.dtype, lenses.plan.parameters
-        self.struct.intrinsics, self.struct.usable = map(address, kept)
+        self.struct.intrinsics = self.struct.keep(intrinsics.contiguous())
+        self.struct.usable = None if usable is None else self.struct.keep((usable > 0).contiguous())
         self.pointer = addressof(self.struct)
 
     @classmethod
-    def made(cls, base: Native, struct: CamerasStruct, room: object, lenses: Callable[[Native], Lenses]) -> Native:
+    def made(cls, base: Native, struct: structs.Cameras, room: object, lenses: Callable[[Native], Lenses]) -> Native:
         """Return cameras that compiled code made, in `room`, like others; `lenses` makes their lenses at first use."""
         native = cls.__new__(cls)
         native.plan, native.dtype, native.parameters = base.plan, base.dtype, base.parameters
         native.struct, native.cameras, native.pointer = struct, struct.cameras, addressof(struct)
-        native._kept, native._make_lenses = room, lenses
+        native._make_lenses = lenses
+        struct.hold(room)
         return native
 
     @functools.cached_property
@@ -347,11 +303,11 @@ def _plan_of(optics_of: Optics, k: Tensor) -> Plan | None:
     return None if parts is None else Plan(chart, lens, parts, given)
 
 
-def codes(chart: Chart, lens: Lens) -> list[_Part] | None:
+def codes(chart: Chart, lens: Lens) -> list[Part] | None:
     """Return the parts of chart and lens, or None if one part has no code."""
     parts = [_chart(chart), *map(_stage, lens.stages)]
     known = [part for part in parts if part is not None]
-    return known if len(known) == len(parts) <= _MOST_PARTS else None
+    return known if len(known) == len(parts) <= MOST_PARTS else None
 
 
 def _code(part: Chart | Stage | RadialFactor | type[RadialFactor]) -> int | None:
@@ -359,17 +315,17 @@ def _code(part: Chart | Stage | RadialFactor | type[RadialFactor]) -> int | None
     return vars(part if isinstance(part, type) else type(part)).get("code")
 
 
-def _chart(chart: Chart) -> _Part | None:
+def _chart(chart: Chart) -> Part | None:
     flags = 0
     if type(chart) is optics.Transverse:
-        chart, flags = chart.chart, _TRANSVERSE
+        chart, flags = chart.chart, structs.TRANSVERSE
     kind = _code(chart)
     if kind is None:
         return None
-    part = _Part(kind, flags)
+    part = Part(kind=kind, flags=flags)
     if isinstance(chart, optics.Unified):
-        part.flags |= _HAS_XI * chart.has_xi | _HAS_BETA * chart.has_beta
-        part.flags |= _HAS_ALPHA * (chart.fixed_alpha is None)
+        part.flags |= structs.HAS_XI * chart.has_xi | structs.HAS_BETA * chart.has_beta
+        part.flags |= structs.HAS_ALPHA * (chart.fixed_alpha is None)
         part.constant = chart.fixed_alpha or 0.0
     if isinstance(chart, optics.Inverted):
         part.factor, part.n = _code(chart.factor) or 0, len(chart.parameters)
@@ -377,19 +333,22 @@ def _chart(chart: Chart) -> _Part | None:
     return part
 
 
-def _stage(stage: Stage) -> _Part | None:
+def _stage(stage: Stage) -> Part | None:
     kind = _code(stage)
     if kind is not None and isinstance(stage, optics.Surface):
-        return _Part(kind, stage.order, 0, stage.columns, stage.rows, stage.behind, stage.cells, stage.centre)
+        part = Part(kind=kind, flags=stage.order, n=stage.columns, m=stage.rows, constant=stage.behind)
+        part.cells[:], part.centre[:] = stage.cells, stage.centre
+        return part
     if kind is None or not isinstance(stage, optics.Planar):
-        return None if kind is None else _Part(kind)
-    part, radial = _Part(kind, _TANGENTIAL * bool(stage.tangential) | _PRISM * bool(stage.prism)), stage.radial
+        return None if kind is None else Part(kind=kind)
+    flags = structs.TANGENTIAL * bool(stage.tangential) | structs.PRISM * bool(stage.prism)
+    part, radial = Part(kind=kind, flags=flags), stage.radial
     if radial is None:
         return part
     part.factor, part.n = _code(radial) or 0, len(radial.parameters)
     if isinstance(radial, optics.Rational):
         part.n, part.m = len(radial.numerator.parameters), len(radial.denominator.parameters)
-        if part.n + part.m > _MOST_DEGREE:
+        if part.n + part.m > MOST_DEGREE:
             return None
     if isinstance(radial, optics.RadiusTable):
         part.n = len(radial.nodes)
@@ -399,16 +358,6 @@ def _stage(stage: Stage) -> _Part | None:
 def _constants(lens: Lens) -> Sequence[Tensor]:
     radial = lens.radial
     return (*radial.nodes, radial.end) if isinstance(radial, optics.RadiusTable) else ()
-
-
-@functools.cache
-def entry(name: str, result: type | None) -> ctypes._NamedFuncPointer:
-    """Return a function of the compiled library, which must be loaded, with the type of its result."""
-    found = library()
-    assert found is not None  # else there is no `Native`
-    entry: ctypes._NamedFuncPointer = getattr(found, name)
-    entry.restype = result
-    return entry
 
 
 def address(tensor: Tensor | None) -> int:

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.recorded import CLASSES
+from camtorch.native.structs import AZIMUTHS
 from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.projection.domain import domain_of
-from camtorch.projection.fold import AZIMUTHS
 from camtorch.projection.solve import search
 from camtorch.values.arguments import columns
 

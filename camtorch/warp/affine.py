@@ -16,10 +16,11 @@ from camtorch.cameras.opaque import opaque
 from camtorch.evaluate.door import in_transform, keeps_graph
 from camtorch.evaluate.known import are_known, are_plain, is_unknown
 from camtorch.native.sampler import maker
+from camtorch.native.structs import STEP
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
-from camtorch.warp.grid import STEP, Lattice, Sampling, coarse, straight_lattice
+from camtorch.warp.grid import Lattice, Sampling, coarse, straight_lattice
 from camtorch.warp.moving import placed
 from camtorch.warp.panorama import lengths
 from camtorch.warp.plan import Route, lengthened, positions, route_of, warped

@@ -7,11 +7,11 @@ from torch import Tensor
 
 from camtorch.evaluate.elsewhere import sent
 from camtorch.evaluate.known import is_predicted, known_true
+from camtorch.native.structs import EDGE_POINTS
 from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes
 from camtorch.warp.pair import CameraPair
 from camtorch.warp.panorama import PANORAMAS
 
-_EDGE_SAMPLES = 64  # per edge, as in geometry.h: this encloses 500 px bent to a radius of 300 px to 0.03 px
 _ROUNDED = 1e-3  # pixels from a panorama's edges, where rounding would cost rays
 _LATTICE = 16  # steps across and down the target, between points that are tested against a polygon
 
@@ -36,7 +36,7 @@ def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
     if corners.ndim < 2:
         raise ValueError(f"Warp: corners must be (B, *N, K, 2); got shape {tuple(corners.shape)}")
     finite = torch.isfinite(corners).flatten(-2).all(-1, keepdim=True)
-    moved, mapped = warp._move(along_edges(corners, _EDGE_SAMPLES))
+    moved, mapped = warp._move(along_edges(corners, EDGE_POINTS))
     mapped = mapped & finite
     low = torch.where(mapped.unsqueeze(-1), moved, torch.inf).amin(-2)
     high = torch.where(mapped.unsqueeze(-1), moved, -torch.inf).amax(-2)

@@ -19,9 +19,10 @@ from camtorch.evaluate.elsewhere import sent
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free, are_plain, is_unknown
 from camtorch.native.library import native_available
-from camtorch.native.sampler import CUBIC, DOUBT, EMPTY, TODO, classify
+from camtorch.native.sampler import classify
+from camtorch.native.structs import CELL_CUBIC, CELL_DOUBT, CELL_EMPTY, CELL_TODO, POSITIONS, STEP
 from camtorch.poses.rotations import turn
-from camtorch.projection.compiled import POSITIONS, Between
+from camtorch.projection.compiled import Between
 from camtorch.values.threads import on_one_thread
 from camtorch.warp.moving import between
 from camtorch.warp.panorama import goes_round, lengths, off_poles, within_turn
@@ -30,7 +31,6 @@ OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its i
 _FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
 _STRIP = 1 << 19  # pixels
 FEWEST = 8  # cells along a side from which on a lattice pays
-STEP = 8  # pixels between the nodes of a lattice
 _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
 _kept_weights = Kept(4)  # on other devices, where each operator is a launch
 MOST_KEPT = 1 << 16  # nodes of a lattice whose pixels are kept for the next one
@@ -72,8 +72,8 @@ class Sampling(NamedTuple):
 class Lattice:
     """Where every pixel of a target (h, w) samples the source's image, by `nodes` (B, 2, n + 5, m + 5) of every eighth.
 
-    Nodes begin at pixel (-16, -16); a cubic is laid through four along each axis. `cells` (B, n, m) int32 are `EMPTY`,
-    `CUBIC`, or a place in `exact` (2, K, 8, 8), positions for each pixel, NaN where none is mapped.
+    Nodes begin at pixel (-16, -16); a cubic is laid through four along each axis. `cells` (B, n, m) int32 are
+    `CELL_EMPTY`, `CELL_CUBIC`, or a place in `exact` (2, K, 8, 8), positions for each pixel, NaN where none is mapped.
 
     done: (3, K) the cells of `exact`, in its order; None where `cells` may be looked at.
     """
@@ -115,7 +115,7 @@ class Lattice:
             _, n, m = self.cells.shape
             planes = interpolated(self.nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
             blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))
-            some = self.cells != EMPTY
+            some = self.cells != CELL_EMPTY
             blocks.masked_fill_(~some[:, None, :, None, :, None], OUTSIDE)
             seen = some[:, :, None, :, None].expand(-1, -1, STEP, -1, STEP).flatten(3, 4).flatten(1, 2)
             camera, i, j = (self.cells >= 0).nonzero(as_tuple=True) if self.done is None else self.done.unbind()
@@ -298,7 +298,7 @@ def on_lattice(
         return None
     computed = like.new_empty(2, 0, STEP, STEP)
     if most:
-        computed = _compute(exact, rows.start, cells, (cells == TODO) | (cells == DOUBT), like)
+        computed = _compute(exact, rows.start, cells, (cells == CELL_TODO) | (cells == CELL_DOUBT), like)
     return Lattice(lattice, cells, computed, (height, width))
 
 
@@ -313,7 +313,7 @@ def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype
     v, u = ((torch.arange(k + 5, dtype=matrix.dtype, device=matrix.device) - 2) * STEP for k in (n, m))
     across, down, shift = (column[..., None, None] for column in matrix.unbind(-1))
     nodes = (across * u + (down * (v + rows.start)[:, None] + shift)).to(dtype)
-    cells = torch.full((count, n, m), CUBIC, dtype=torch.int32, device=matrix.device)
+    cells = torch.full((count, n, m), CELL_CUBIC, dtype=torch.int32, device=matrix.device)
     return Lattice(nodes, cells, nodes.new_empty(2, 0, STEP, STEP), (len(rows), width))
 
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import math
-import struct
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
-from itertools import count as count_from
 from typing import Any, Literal
 
 import numpy as np
@@ -32,27 +28,29 @@ from camtorch.evaluate.export import with_values
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import is_unknown
 from camtorch.native import memory
-from camtorch.native.library import library
-from camtorch.native.sampler import Call, is_quick, maker, packed, takes, tiles_of
-from camtorch.projection.compiled import (
+from camtorch.native.library import loaded
+from camtorch.native.sampler import Call, describe, is_quick, maker, takes, tiles_of
+from camtorch.native.structs import (
     BOXES,
-    LATTICE_WORDS,
+    LEFT_BITS,
     LEFT_FROM,
     LEFT_LABELS,
     LEFT_MOST,
     LEFT_TO,
     ON_IMAGE,
     POSITIONS,
-    Between,
-    Lattices,
-    packed_move,
-    run_and_follow,
+    STEP,
+    Job,
+    Move,
+    Together,
+    Turned,
 )
+from camtorch.projection.compiled import Between, Lattices, run_and_follow
 from camtorch.projection.evaluation import compiled_of
-from camtorch.projection.native_cameras import Native, entry
+from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 from camtorch.warp import compiled
-from camtorch.warp.grid import FEWEST, MOST_KEPT, STEP, Lattice, Sampling, coarse, kept_probes, local_scale
+from camtorch.warp.grid import FEWEST, MOST_KEPT, Lattice, Sampling, coarse, kept_probes, local_scale
 from camtorch.warp.pair import CameraPair, Plan
 from camtorch.warp.panorama import goes_round
 from camtorch.warp.sampling import (
@@ -77,10 +75,9 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]  # (height, width) of the source
 
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
 _STRIP = 1 << 21  # pixels of such a strip
-_HEAD, _WIDTHS = 7, {"pixels": 22, "turned": 8, "images": 38}  # words of the structures of C
 _FEW = 2  # tiles of an image that one thread makes alone
 _EVEN = 4  # samples a thread from which on it matters little that the last ones leave some threads idle
-_PIXELS = 1 << 3  # flags of what is left of pixels are times this
+_PIXELS = 1 << LEFT_BITS  # flags of what is left of pixels are times this
 
 
 def route_of(warp: CameraPair, images: Tensor | None = None) -> Route:
@@ -406,49 +403,45 @@ class SampleCall:
         padding = PADDINGS[max((PADDINGS.index(how.padding_mode) for how in samplers), default=0)]
         with torch.inference_mode(False):
             self._lattices = Lattices(probes, sizes[1], sizes[0], form.tolerance, padding, count)
-        parts: dict[str, list[bytes]] = {"pixels": [], "turned": [], "images": []}
-        kinds, as_they_are = list[str](), list[bool]()
-        self._makers: list[Callable[[], Tensor] | None] = []
-        self._kept: list[object] = []  # what the words point to
+        images, moving = len(samplers), sum(how in ("pixels", "boxes") for how in form.hows)
+        self._jobs, pixels = (Job * images)(), (Move * moving)()
+        vectors = (Turned * (len(form.hows) - images - moving))()
+        call = self._call = Together(job_count=len(self._jobs), move_count=len(pixels), turned_count=len(vectors))
+        call.jobs, call.moves, call.turned = (call.keep(array) for array in (self._jobs, pixels, vectors))
+        jobs, moves, turns = iter(self._jobs), iter(pixels), iter(vectors)
+        # the structure of each value, and whether it goes in as it is
+        self._slots = list[tuple[Job | Move | Turned, bool]]()
+        self._makers = list[Callable[[], Tensor]]()  # of images
         self._tiles = 1
         for value, how in zip(form.values, form.hows, strict=True):
-            make = None
+            slot: Job | Move | Turned
             if isinstance(how, Sampler):
-                image, make = form.images(value), form.maker(value)
+                slot = job = next(jobs)
+                image = form.images(value)
                 result = maker(image, count, sizes[1])()
                 fill = how.fill * image.shape[1] if len(how.fill) == 1 else how.fill
-                place = (0,) * 8 + self._lattices.places
-                words, holds = packed(image, result, how.mode, how.padding_mode, fill, place)
-                self._kept.append(holds)
+                describe(job, image, result, how.mode, how.padding_mode, fill)
+                self._lattices.lay(job)
                 self._tiles = max(self._tiles, tiles_of(result[:1]))
+                self._makers.append(form.maker(value))
             elif how in ("pixels", "boxes"):
-                each, move = (2, ON_IMAGE) if how == "pixels" else (4, BOXES)
+                slot, each = next(moves), 2 if how == "pixels" else 4
                 many = value.numel() // (each * count) if count else 0
-                rows = 0, each * many, each, 1, 0, each * many, each, 1, 0, many, max(many, 1), 0
-                words = packed_move(0, 0, 0, 0, 3, 1, count, move, *sizes[1], *rows)
+                slot.turn_strides[:], slot.cameras, (slot.height, slot.width) = (0, 3, 1), count, sizes[1]
+                slot.form, slot.count, slot.tile = ON_IMAGE if how == "pixels" else BOXES, many, max(many, 1)
+                slot.row_strides[:] = slot.result_strides[:] = each * many, each, 1
             else:
-                steps = (3, 1, value.numel() // 3) if how == "rays" else (1, value.shape[-1], value.shape[-1])
-                words = struct.pack("8q", 0, 0, 0, *steps, dtype == torch.float64, how == "pose")
-            as_they_are.append(value.dtype == dtype and value.is_contiguous())
-            kinds.append("images" if make else "pixels" if how in ("pixels", "boxes") else "turned")
-            parts[kinds[-1]].append(words)
-            self._makers.append(make)
-        starts = accumulate((len(b"".join(part)) // 8 for part in parts.values()), initial=_HEAD + LATTICE_WORDS)
-        first = dict(zip(parts, starts, strict=False))
-        text = bytes(8 * _HEAD) + self._lattices.words + b"".join(map(b"".join, parts.values()))
-        self._words = (ctypes.c_int64 * (len(text) // 8)).from_buffer_copy(text)
-        here, at = ctypes.addressof(self._words), {kind: count_from(first[kind], _WIDTHS[kind]) for kind in parts}
-        images, pixels, turned = ((here + 8 * first[kind], len(parts[kind])) for kind in ("images", "pixels", "turned"))
-        self._words[:_HEAD] = [*images, 1, *pixels, *turned]
+                slot, width = next(turns), value.shape[-1]
+                slot.strides[:], slot.count = ((3, 1), value.numel() // 3) if how == "rays" else ((1, width), width)
+                slot.is_double, slot.is_pose = dtype == torch.float64, how == "pose"
+            self._slots.append((slot, value.dtype == dtype and value.is_contiguous()))
+        call.lattices = self._lattices.struct
+        self._back = call.lattices.move
         if count > 1:  # each as soon as its lattice is there
-            self._words[_HEAD + LATTICE_WORDS - 2 : _HEAD + LATTICE_WORDS] = [*images]
+            call.lattices.jobs, call.lattices.job_count = call.jobs, call.job_count
         else:
-            # one thread makes the lattice, and needs no counter of those made
-            self._words[_HEAD + _WIDTHS["pixels"] - 1] = 0
-        # where the pointers to each value go, and whether it goes in as it is
-        self._slots = [(kind, next(at[kind]), plain) for kind, plain in zip(kinds, as_they_are, strict=True)]
+            self._back.next = None  # one thread makes the lattice, and needs no counter of those made
         self._doubtful = [i for i, how in enumerate(form.hows) if how in ("boxes", "pose")]
-        self._first_job, self._jobs, self._has_pixels = first["images"], images[1], pixels[1] > 0
         self._dtype, self._count = dtype, count
         self.keeps_dtypes: bool = all(
             isinstance(how, Sampler) or value.dtype == dtype for value, how in zip(form.values, form.hows, strict=True)
@@ -474,41 +467,41 @@ class SampleCall:
             turns = None if rotation is None else rotation.mT
             if not _surely_keeps_size(Between(target, source, turns, self._sizes[0], False), self._sizes):
                 return None
-        words, turn = self._words, 0 if rotation is None else rotation.data_ptr()
+        call, turn = self._call, None if rotation is None else rotation.data_ptr()
         by_camera = 9 if rotation is not None and rotation.ndim > 2 and len(rotation) > 1 else 0
         target.add_table()
-        if self._has_pixels:
+        if call.move_count:
             source.add_table()
-        words[_HEAD : _HEAD + 4] = [target.pointer, source.pointer, turn, by_camera]
+        back = self._back
+        back.from_, back.to, back.turns, back.turn_strides[0] = target.pointer, source.pointer, turn, by_camera
         results: list[tuple[Tensor, Tensor | None] | None] = []
-        given = []  # pixels in the dtype of the cameras, without gaps, for as long as the call
-        for value, (kind, at, is_plain), make in zip(values, self._slots, self._makers, strict=True):
+        given, makers = [], iter(self._makers)  # pixels in the cameras' dtype, without gaps, for as long as the call
+        for value, (slot, is_plain) in zip(values, self._slots, strict=True):
             valid = None
-            if make is not None:
-                result = make()
-                words[at], words[at + 1] = value.data_ptr(), result.data_ptr()
-            elif kind == "turned":
+            if isinstance(slot, Job):
+                result = next(makers)()
+                slot.source, slot.result = value.data_ptr(), result.data_ptr()
+            elif isinstance(slot, Turned):
                 result = value.clone()
-                words[at], words[at + 1], words[at + 2] = turn, value.data_ptr(), result.data_ptr()
+                slot.turn, slot.rows, slot.results = turn, value.data_ptr(), result.data_ptr()
             else:
                 if not is_plain:
                     value = value.to(dtype).contiguous()
                     given.append(value)
                 result = torch.empty(value.shape, dtype=dtype, device="cpu")
                 valid = torch.empty(value.shape[:-1], dtype=torch.bool, device="cpu")
-                words[at : at + 4] = [source.pointer, target.pointer, turn, by_camera]
-                words[at + 10], words[at + 14], words[at + 18] = value.data_ptr(), result.data_ptr(), valid.data_ptr()
+                slot.from_, slot.to, slot.turns, slot.turn_strides[0] = source.pointer, target.pointer, turn, by_camera
+                slot.rows, slot.results, slot.valid = value.data_ptr(), result.data_ptr(), valid.data_ptr()
             results.append((result, valid))
-        native, threads, jobs = library(), thread_count(), self._jobs
-        assert native is not None  # or nobody has a `Native`
+        native, threads, jobs = loaded(), thread_count(), len(self._jobs)
         if self._count > 1 and jobs:
-            call, threads, counters = ctypes.byref(words, 8 * _HEAD), min(threads, self._count), self._lattices.counters
-            if run_and_follow(entry("camtorch_lattices", ctypes.c_int64), call, threads, counters, target, source):
+            run, counters = native.camtorch_lattices, self._lattices.counters
+            if run_and_follow(run, call.lattices, self._count, counters, target, source):
                 return None
             jobs = 0  # the images are made
-        words[1] = jobs
-        words[2] = is_whole = threads == 1 or self._tiles <= _FEW or not jobs
-        while flags := native.camtorch_together(words):
+        is_whole = threads == 1 or self._tiles <= _FEW or not jobs
+        call.job_count, call.is_whole = jobs, is_whole
+        while flags := native.camtorch_together(call):
             if flags & LEFT_MOST:
                 return None
             # of the lattice, else of the pixels, which go the other way
@@ -518,15 +511,13 @@ class SampleCall:
             if left & LEFT_TO:
                 end.follow()
             if flags >= _PIXELS:  # the images are made
-                words[1] = 0
+                call.job_count = 0
                 if left == LEFT_LABELS:
                     for i in self._doubtful:
                         results[i] = None
                     break
         if not is_whole:
-            for i in range(self._jobs):
-                job = words[self._first_job + i * _WIDTHS["images"] : self._first_job + (i + 1) * _WIDTHS["images"]]
-                run = (ctypes.c_int64 * len(job))(*job)
-                run[-1] = 0
-                spread(lambda: native.camtorch_sample(run), min(threads, self._tiles))  # noqa: B023 (called at once)
+            for job in self._jobs:
+                job.next = 0
+                spread(functools.partial(native.camtorch_sample, job), min(threads, self._tiles))
         return results

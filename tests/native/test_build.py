@@ -26,7 +26,6 @@ DISPATCH = """
 #define API __attribute__((visibility("default")))
 int twice_baseline(int);
 API unsigned camtorch_sources(void) { return SOURCES; }
-API const char *camtorch_variant(void) { return "stand-in"; }
 API int twice(int x) { return twice_baseline(x); }
 #ifdef HAS_AVX2
 int twice_avx2(int);
@@ -51,7 +50,7 @@ def no_compiler(monkeypatch, tmp_path):
 def test_a_library_is_built_and_nothing_else_is_left(tmp_path):
     write(tmp_path)
     path = build(tmp_path, sources=tmp_path)
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIBRARY, "dispatch.c", "kernel.c"])
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIBRARY, "_objects", "dispatch.c", "kernel.c"])
     loaded, inode = ctypes.CDLL(str(path)), path.stat().st_ino
     assert not hasattr(loaded, "twice_baseline")  # what is not marked stays inside
     assert not [name for name in (b"Py", b"crtfast", b"OMP") if name in path.read_bytes()]
@@ -93,7 +92,38 @@ def test_an_error_is_what_the_compiler_said_and_leaves_the_library_that_was(tmp_
         build(tmp_path, sources=tmp_path)
     assert "kernel.c" in str(caught.value)
     assert (tmp_path / LIBRARY).read_bytes() == before
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIBRARY, "dispatch.c", "kernel.c"])
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIBRARY, "_objects", "dispatch.c", "kernel.c"])
+
+
+@compiles
+def test_a_unit_is_compiled_again_if_it_or_its_headers_or_the_options_changed(tmp_path, monkeypatch, capfd):
+    (tmp_path / "twice.h").write_text("enum { TWO = 2 }; /* a number */\n")
+    write(tmp_path, kernel='#include "twice.h"\n' + KERNEL.replace("2 *", "TWO *"))
+    monkeypatch.setattr(building, "VARIANTS", {"baseline": (), "avx2": ("-O1",)})
+
+    def compiled():
+        before = {path: path.stat().st_mtime_ns for path in (tmp_path / "_objects").glob("*")}
+        twice = ctypes.CDLL(str(shutil.copy(build(tmp_path, sources=tmp_path), tmp_path / f"{len(done)}.so"))).twice(21)
+        after = {path: path.stat().st_mtime_ns for path in (tmp_path / "_objects").glob("*")}
+        done.append(sorted(path.name.split(".")[0] for path in after.keys() - before.keys()))
+        assert len(after) == len({path.name.split(".")[0] for path in after})  # older ones are gone
+        return twice, {path for path in before if path in after and after[path] != before[path]}
+
+    done = []
+    assert compiled() == compiled() == (42, set())
+    assert done == [["dispatch", "kernel_avx2", "kernel_baseline"], []]
+    assert "compiling 3 units of 3, for baseline, avx2" in capfd.readouterr().err
+    (tmp_path / "twice.h").write_text("enum { TWO = 2 }; /* another comment */\n")
+    compiled()
+    (tmp_path / "twice.h").write_text("enum { TWO = 3 };\n")
+    monkeypatch.setenv("CAMTORCH_VARIANTS", "baseline")
+    assert compiled() == (63, set())
+    monkeypatch.setenv("CC", f"{COMPILER} -DMORE")
+    compiled()
+    assert done[2:] == [["dispatch"], ["dispatch", "kernel_baseline"], ["dispatch", "kernel_baseline"]]
+    monkeypatch.setenv("CAMTORCH_VARIANTS", "baseline,sse9")
+    with pytest.raises(BuildError, match="must be some of baseline,avx2; got baseline,sse9"):
+        compiled()
 
 
 def test_without_a_compiler_the_error_says_what_was_sought(tmp_path, no_compiler, monkeypatch):
@@ -106,7 +136,7 @@ def test_without_a_compiler_the_error_says_what_was_sought(tmp_path, no_compiler
 
 def copy(folder):
     """A package of camtorch's with no library in it, and the path of its `native`."""
-    ignore = shutil.ignore_patterns("_sampler.*", "__pycache__", "*.[ch]")
+    ignore = shutil.ignore_patterns("_sampler.*", "_objects", "__pycache__", "*.[ch]")
     return shutil.copytree(ROOT / "camtorch", folder / "camtorch", ignore=ignore) / "native"
 
 
@@ -148,9 +178,12 @@ def test_a_library_of_other_sources_is_not_used_and_said_once_and_the_environmen
         assert "pip install -e ." in told
     for path in folder.glob("*.[ch]"):  # what packs programs may leave out what is no program
         path.unlink()
-    assert version(tmp_path).endswith("native sampler: stand-in")
-    for value, said in (("1", "stand-in"), ("FALSE", "off (CAMTORCH_NATIVE=0)"), ("off", "off (CAMTORCH_NATIVE=0)")):
-        assert version(tmp_path, CAMTORCH_NATIVE=value).endswith(f"native sampler: {said}")
+    assert "not used (its structures, values or calls are not those" in version(tmp_path)
+    if (ROOT / "camtorch" / "native" / LIBRARY).exists():
+        shutil.copy(ROOT / "camtorch" / "native" / LIBRARY, folder)
+        assert version(tmp_path, CAMTORCH_NATIVE="1", CAMTORCH_CPU="baseline").endswith("native sampler: baseline")
+    for value in ("FALSE", "off"):
+        assert version(tmp_path, CAMTORCH_NATIVE=value).endswith("native sampler: off (CAMTORCH_NATIVE=0)")
 
 
 def test_where_none_was_built_or_loads_version_says_why(tmp_path):

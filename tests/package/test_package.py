@@ -37,7 +37,7 @@ def hatchling(tmp_path_factory):
 def checkout(tmp_path):
     """A copy of what a wheel is made of, with a sampler that takes no time to compile, and an older library in it."""
     folder = tmp_path / "checkout"
-    ignore = shutil.ignore_patterns("_sampler.*", "__pycache__", "*.[ch]")
+    ignore = shutil.ignore_patterns("_sampler.*", "_objects", "__pycache__", "*.[ch]")
     shutil.copytree(ROOT / "camtorch", folder / "camtorch", ignore=ignore)
     for name in ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE", ".gitignore"):
         shutil.copy(ROOT / name, folder)

@@ -1,0 +1,84 @@
+"""Python and C share structures, values and calls, and a library that does not agree with Python is not used."""
+
+import ctypes
+import importlib
+import inspect
+import shutil
+
+import pytest
+from test_build import compiles
+
+from camtorch.native import build as building
+from camtorch.native import headers, known, structs
+from camtorch.native.library import library, native_available
+
+has_library = pytest.mark.skipif(not native_available(), reason="no compiled library is here")
+HERE = building._HERE
+
+
+def test_the_generated_file_is_what_the_headers_give_and_ctypes_lays_it_out_so():
+    if not (HERE / "dispatch.c").exists():
+        pytest.skip("the sources are not here")
+    assert (HERE / "structs.py").read_text() == headers.structs_py(), "run `python -m camtorch.native.headers`"
+    found = headers.read()
+    for name, fields in found.structs.items():
+        struct = getattr(structs, name)
+        places = [
+            (field.name, getattr(struct, field.name).offset, getattr(struct, field.name).size) for field in fields
+        ]
+        assert places == [(field.name, field.offset, field.size) for field in fields]
+        assert ctypes.sizeof(struct) == found.sizes[name]
+
+
+@has_library
+def test_a_wrong_field_a_wrong_length_and_a_wrong_structure_are_errors():
+    rows = structs.Rows()
+    with pytest.raises(AttributeError):
+        rows.colour = 1
+    with pytest.raises(ValueError, match="same size"):
+        rows.row_strides[:] = 1, 2
+    with pytest.raises(ctypes.ArgumentError):
+        library().camtorch_views(rows)
+
+
+@has_library
+def test_each_call_has_a_known_answer():
+    asked = [name for name, *_ in known._answers(library())]
+    calls = headers.read().calls.items()
+    assert sorted(asked) == sorted(name for name, (_, given) in calls if given not in ([], ["char*"]))
+
+
+FIELD = "    int64_t next; /* the tile that whoever is free takes */\n"
+
+
+@compiles
+@pytest.mark.parametrize(
+    ("file", "old", "new", "says"),
+    [
+        ("sampler.h", FIELD, "    int64_t anything[64];\n" + FIELD, "its structures, values or calls are not those"),
+        ("geometry.h", "flags, factor, n, m;", "flags, factor, n, m, more;", "its structures"),  # where nothing moves
+        ("sampler.h", "int64_t cell_stride, rows, columns", "int64_t cell_stride, columns, rows", "its structures"),
+        ("sampler.h", "SCRATCH = 25", "SCRATCH = 26", "its structures"),
+        ("dispatch.c", "ENTRY(void, views, const Views *)", "ENTRY(void, views, const Steps *)", "its structures"),
+        ("sampler.h", "", "", "camtorch_geometry gives a wrong answer to a known call"),
+    ],
+)
+def test_a_library_that_python_does_not_know_is_refused_with_words(tmp_path, monkeypatch, file, old, new, says):
+    for path in [*HERE.glob("*.h"), HERE / "dispatch.c"]:
+        shutil.copy(path, tmp_path)
+    text = (tmp_path / file).read_text()
+    assert old in text
+    (tmp_path / file).write_text(text.replace(old, new, 1))
+    entries = [(name[9:], result) for name, (result, given) in headers.read(tmp_path).calls.items() if len(given) == 1]
+    stubs = "".join(f"{'int' if r == 'void' else r} {name}_baseline(void *x) {{ return 0; }}\n" for name, r in entries)
+    (tmp_path / "kernel.c").write_text("#include <stdint.h>\n" + stubs)
+    monkeypatch.setattr(building, "VARIANTS", {"baseline": ()})
+    building.build(tmp_path, sources=tmp_path)
+    loading = importlib.import_module("camtorch.native.library")
+    monkeypatch.setattr(loading, "_HERE", tmp_path)
+    monkeypatch.setattr(loading, "checksum", lambda: building.checksum(tmp_path))
+    monkeypatch.delenv("CAMTORCH_NATIVE", raising=False)
+    found, why, is_stale = inspect.unwrap(loading._find)()
+    assert found is None
+    assert is_stale
+    assert says in why
