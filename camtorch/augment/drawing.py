@@ -15,41 +15,21 @@ from camtorch.augment.change import Drawn
 from camtorch.augment.filling import looked_at, with_care
 from camtorch.augment.jitter import PARTS, border, lens_ends, measured_once, sensitivity
 from camtorch.cameras.camera import Camera
+from camtorch.native import structs
 from camtorch.native.library import loaded
-from camtorch.native.structs import (
-    AMOUNTS,
-    AZIMUTHS,
-    CENTRE,
-    CROP,
-    DISTORTION,
-    DRAWN_KINDS,
-    EXTENT,
-    FOCAL,
-    LEFT_BASE,
-    LEFT_ENDS,
-    LEFT_LENS,
-    LEFT_SOURCE,
-    NO_CAMERA,
-    PITCH,
-    PLACE,
-    ROLL,
-    TOO_WIDE,
-    WIDTH,
-    YAW,
-    ZOOM,
-    Draws,
-)
 from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.projection.evaluation import rows_of
 from camtorch.projection.native_cameras import Lenses, Native, address, lenses_of
 from camtorch.projection.rows import CameraRows, domain_for, single_native
 from camtorch.rays.lattices import defined_or
+from camtorch.values.arguments import present
 from camtorch.values.module import model_of, remade
 from camtorch.warp.sampling import Options
 
-_SIZES = {"centre": 2, "distortion": AMOUNTS, "place": 2}
-_KINDS = {"yaw": YAW, "pitch": PITCH, "roll": ROLL, "zoom": ZOOM, "fov": WIDTH, "focal": FOCAL, "centre": CENTRE}
-_KINDS |= {"distortion": DISTORTION, "crop": CROP, "place": PLACE}
+_SIZES = {"centre": 2, "distortion": structs.AMOUNTS, "place": 2}
+_KINDS = {"yaw": structs.YAW, "pitch": structs.PITCH, "roll": structs.ROLL, "zoom": structs.ZOOM, "fov": structs.WIDTH}
+_KINDS |= {"focal": structs.FOCAL, "centre": structs.CENTRE, "distortion": structs.DISTORTION, "crop": structs.CROP}
+_KINDS["place"] = structs.PLACE
 _TURNS = {"yaw", "pitch", "roll"}
 
 
@@ -98,8 +78,8 @@ class Start:
         self._follows = False  # whether new lenses want limits
         self._distortion = base.distortion.detach()
         count = self._distortion.shape[-1]
-        call = self._call = Draws(count=count, height=size[0], width=size[1], is_each=self._rows > 0)
-        call.first[:] = [-1] * DRAWN_KINDS
+        call = self._call = structs.Draws(count=count, height=size[0], width=size[1], is_each=self._rows > 0)
+        call.first[:] = [-1] * structs.DRAWN_KINDS
         at, self._room = 0, 13 + count
         for name in self.names:
             call.first[_KINDS[name]], at = at, at + _SIZES.get(name, 1)
@@ -145,7 +125,7 @@ class Start:
 
     def one(self, values: Sequence[float]) -> One | None:
         """Return the only new camera of values in a row, as they were drawn; None if it wants more than one call."""
-        call, dtype = Draws.from_buffer_copy(self._call), self.dtype
+        call, dtype = structs.Draws.from_buffer_copy(self._call), self.dtype
         numbers = (c_double * (len(values) + 2))(1, 1, *values)  # after the factor, and what is filled
         room, intrinsics = torch.empty(self._room, dtype=dtype, device="cpu"), torch.empty(4, dtype=dtype, device="cpu")
         distortion = torch.empty(call.count, dtype=dtype, device="cpu") if self._moves else self._distortion.clone()
@@ -170,15 +150,18 @@ class Start:
         factor, found = (torch.tensor([value], dtype=torch.float64) for value in (one.factor, one.filled))
         return Drawn(base, intrinsics, k, self.size, rotation, options, self.before, one.native, factor, found)
 
-    def _add_limits(self, call: Draws, rows: int) -> list[Tensor]:
+    def _add_limits(self, call: structs.Draws, rows: int) -> list[Tensor]:
         """Give room for the limits of new lenses, if some have wanted them."""
         if not self._follows:
             return []
-        kept = [torch.empty(rows * count, dtype=self._native.dtype, device="cpu") for count in (AZIMUTHS, EXTENT)]
+        kept = [
+            torch.empty(rows * count, dtype=self._native.dtype, device="cpu")
+            for count in (structs.AZIMUTHS, structs.EXTENT)
+        ]
         call.made.limits2, call.made.extent = (tensor.data_ptr() for tensor in kept)
         return kept
 
-    def _made(self, call: Draws, kept: list[Tensor], rows: int) -> Native:
+    def _made(self, call: structs.Draws, kept: list[Tensor], rows: int) -> Native:
         """Return the new cameras for compiled code."""
         native = self._native
         lenses = partial(self._lenses, kept[0], rows) if self._knows else lambda _: native.lenses
@@ -186,7 +169,7 @@ class Start:
 
     def drawn(self, values: Mapping[str, Any], base: Camera, options: Options) -> Drawn:
         """Return the new cameras, modules like `base`, of values (B,) and (B, size), or numbers and lists for one."""
-        call, native = Draws.from_buffer_copy(self._call), self._native
+        call, native = structs.Draws.from_buffer_copy(self._call), self._native
         given = [values[name] for name in self.names]
         several = [len(value) for value in given if isinstance(value, np.ndarray)]
         rows, is_one = self._rows or (several[0] if several else 1), not (self._rows or several)
@@ -204,22 +187,22 @@ class Start:
         call.factors, call.filled = filled.data_ptr(), filled.data_ptr() + 8 * rows
         tries = self._tries(values, rows, call) if self._moves and not self._knows else None
         kept, run = [room, *self._add_limits(call, rows)], loaded().camtorch_draws
-        while (left := run(call)) & ~NO_CAMERA:
-            if left & TOO_WIDE:
+        while (left := run(call)) & ~structs.NO_CAMERA:
+            if left & structs.TOO_WIDE:
                 widest = np.max(values["fov"])
                 raise ValueError(
                     f"fov must be within the reach of a {base.key} lens of these coefficients; got {widest:g} degrees"
                 )
-            if left & LEFT_BASE:
+            if left & structs.LEFT_BASE:
                 native.follow()
-            if left & LEFT_SOURCE:
+            if left & structs.LEFT_SOURCE:
                 self.before.follow()
-            if left & LEFT_ENDS:
+            if left & structs.LEFT_ENDS:
                 ends = measured_once(lens_ends, remade(self.base, image_size=self.size), self._distortion)
                 self._call.ends = call.ends = self._keep(ends, *ends.shape[-2:])
-            if left & LEFT_LENS and tries is not None:
+            if left & structs.LEFT_LENS and tries is not None:
                 tries.follow()
-            elif left & LEFT_LENS:
+            elif left & structs.LEFT_LENS:
                 self._follows = True
                 kept += self._add_limits(call, rows)
         if call.followed < rows and self._moves:
@@ -239,17 +222,16 @@ class Start:
             intrinsics = intrinsics.view(rows, 4)
         return Drawn(base, intrinsics, k, self.size, turned, options, self.before, made, filled[0], filled[1])
 
-    def _tries(self, values: Mapping[str, Any], rows: int, call: Draws) -> Native:
+    def _tries(self, values: Mapping[str, Any], rows: int, call: structs.Draws) -> Native:
         """Make the lenses that compiled code chooses among, of a model whose domain it does not make by itself."""
-        amounts = torch.from_numpy(np.asarray(values["distortion"]).reshape(-1, AMOUNTS))
-        steps = (amounts.repeat(1, -(-call.count // AMOUNTS))[:, : call.count] * self._sensitivity)[:, None]
+        amounts = torch.from_numpy(np.asarray(values["distortion"]).reshape(-1, structs.AMOUNTS))
+        steps = (amounts.repeat(1, -(-call.count // structs.AMOUNTS))[:, : call.count] * self._sensitivity)[:, None]
         given = self._distortion.double().reshape(-1, 1, call.count)
         tried = (given + given.new_tensor(PARTS)[:, None] * steps).to(self._native.dtype)
         tried, allowed = defined_or(self.base, tried, given.to(tried).expand_as(tried))
         tried = tried.reshape(rows * len(PARTS), call.count)
-        native = CameraRows(model_of(self.base), tried.new_ones(len(tried), 4), tried).native
-        if native is None:
-            raise RuntimeError(f"lenses like {type(self.base).__name__} must have compiled code, as that has; got none")
+        lenses = CameraRows(model_of(self.base), tried.new_ones(len(tried), 4), tried)
+        native = present(lenses.native, "compiled code for lenses like the base")
         native.add_table()
         call.tries, call.tried, call.allowed = native.pointer, tried.data_ptr(), address(allowed)
         call.hold((tried, allowed))

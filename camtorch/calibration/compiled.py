@@ -10,23 +10,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from camtorch.native import structs
 from camtorch.native.library import library, loaded
-from camtorch.native.structs import (
-    AGREED,
-    CAUCHY,
-    FROM_RAYS,
-    HUBER,
-    LEAST_SQUARES,
-    REFINED,
-    SOLVED,
-    Poses,
-    Views,
-)
 from camtorch.poses.rotations import small_turn
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 
-_LOSSES = {None: LEAST_SQUARES, "huber": HUBER, "cauchy": CAUCHY}
+_LOSSES = {None: structs.LEAST_SQUARES, "huber": structs.HUBER, "cauchy": structs.CAUCHY}
 _SHARED = 1 << 9  # points of poses for each further thread
 
 
@@ -59,7 +49,7 @@ def can_search(*tensors: Tensor) -> bool:
 
 def from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return rotations (B, 2, 3, 3), translations and valid as `poses_from_rays` does; row b sees points[b % P]."""
-    count, call = len(rays), Poses(task=FROM_RAYS)
+    count, call = len(rays), structs.Poses(task=structs.FROM_RAYS)
     rotations, translations = rays.new_empty(count, 2, 3, 3), rays.new_empty(count, 2, 3)
     valid = torch.empty(count, 2, dtype=torch.bool, device="cpu")
     call.rays, call.valid = call.keep(rays.contiguous()), valid.data_ptr()
@@ -71,7 +61,7 @@ def refine_poses(
     native: Native, points: Tensor, pixels: Tensor, weights: Tensor, start: tuple[Tensor, Tensor], search: Search
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return rotations, translations and costs (B,) of the minima near `start`; row b sees points[b % P]."""
-    call, costs = Poses(task=REFINED), pixels.new_empty(len(pixels))
+    call, costs = structs.Poses(task=structs.REFINED), pixels.new_empty(len(pixels))
     rotations, translations = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in start)
     call.pixels, call.costs = call.keep(pixels.contiguous()), costs.data_ptr()
     call.valid = call.keep(torch.empty(len(pixels), dtype=torch.bool, device="cpu"))
@@ -94,7 +84,7 @@ def solve_poses(
     sizes = (3, 3), (3,), (3,), (), (6, 6)
     rotations, translations, vectors, rms, covariance = (pixels.new_empty(batch, *size) for size in sizes)
     valid, inliers = (torch.empty(size, dtype=torch.bool, device="cpu") for size in (batch, (batch, count)))
-    call = Poses(task=SOLVED if start is None else AGREED, threshold=threshold)
+    call = structs.Poses(task=structs.SOLVED if start is None else structs.AGREED, threshold=threshold)
     call.pixels, call.valid, call.vectors = call.keep(pixels.contiguous()), valid.data_ptr(), vectors.data_ptr()
     call.rms, call.inliers, call.covariance = rms.data_ptr(), inliers.data_ptr(), covariance.data_ptr()
     _run(call, native, points, pixels, weights, search, (rotations, translations), start or ())
@@ -135,7 +125,7 @@ def project_views(
     size, numbers = len(wanted) + 1, (c_int64 * (len(wanted) + 1))(*wanted)
     view, shared = points.new_empty(count, points.shape[1], 6, 6 + size), points.new_empty(count, size, size)
     points = points if points.stride()[2:] == (3, 1) else points.contiguous()
-    call = Views()
+    call = structs.Views()
     call.cameras, call.points, call.point_strides[:] = native.pointer, points.data_ptr(), points.stride()[:2]
     call.rotations, call.translations, call.pixels, call.given = (
         call.keep(t.contiguous()) for t in (*poses, pixels, weights)
@@ -166,7 +156,7 @@ def turn(rotations: Tensor, steps: Tensor) -> Tensor:
 
 
 def _run(
-    call: Poses,
+    call: structs.Poses,
     native: Native | None,
     points: Tensor,
     rows: Tensor,

@@ -78,10 +78,10 @@ EXPORTED int32_t camtorch_use(const char *name) {
 
 EXPORTED unsigned camtorch_sources(void) { return SOURCES; }
 
-/* Which structures these are; that of structs.py is the same */
+/* A checksum of the structures; `layout` of structure.py is of those of Python */
 EXPORTED unsigned camtorch_layout(void) {
     static const uint32_t numbers[] = {OFFSETS};
-    uint32_t sum = LAYOUT;
+    uint32_t sum = CHECKSUM;
     for (size_t i = 0; i < sizeof numbers / sizeof *numbers; i++) sum = (sum ^ numbers[i]) * 16777619u;
     return sum;
 }

@@ -34,7 +34,6 @@ def _answers(library: Library) -> Iterator[tuple[str, Iterable[float], Iterable[
     unit = _numbers(1, 0, 0, 0, 1, 0, 0, 0, 1)
     made, valid, counters = (c_double * 272)(), (c_uint8 * 128)(*[1] * 128), (c_int64 * 4)()
     out, next_, left = at(made), at(counters), at(counters) + 8
-
     rows = structs.Rows(cameras=at(camera), rows=at(points), results=out, valid=at(valid), count=4, tile=4)
     rows.row_strides[:], rows.result_strides[:] = (0, 3, 1), (0, 2, 1)
     library.camtorch_geometry(rows)
@@ -72,10 +71,8 @@ def _answers(library: Library) -> Iterator[tuple[str, Iterable[float], Iterable[
 
     parts[1].kind, parts[1].factor, parts[1].n = structs.PLANAR, structs.POLYNOMIAL, 1
     bend, ends = _numbers(-1 / 12), _numbers(100)  # r - r^3 / 12 has its fold at 2
-    domain = structs.Domain(
-        parts=at(parts), part_count=2, is_double=1, cameras=1, parameters=at(bend), parameter_count=1
-    )
-    domain.is_radial, domain.most, domain.ends, domain.usual_ends = 1, 1e77, at(ends), at(ends)
+    domain = structs.Domain(parts=at(parts), part_count=2, is_double=1, cameras=1, is_radial=1, most=1e77)
+    domain.parameters, domain.parameter_count, domain.ends, domain.usual_ends = at(bend), 1, at(ends), at(ends)
     domain.safe_radius_sq, domain.image_radius_sq = out, out + 8
     library.camtorch_domain(domain)
     yield "camtorch_domain", made[:2], (4, 4)
@@ -97,35 +94,21 @@ def _answers(library: Library) -> Iterator[tuple[str, Iterable[float], Iterable[
     yield "camtorch_together", (most, *made[:3]), (0, -2, 1, 4)
 
     views = structs.Views(cameras=at(camera), points=at(points), rotations=at(unit), translations=at(zeros), problems=1)
-    views.pixels, views.given, views.residuals, views.weights, views.valid = (
-        at(twos),
-        at(ones),
-        out,
-        out + 64,
-        at(valid),
-    )
-    views.costs, views.views, views.count, views.left = out + 128, 1, 4, left
+    views.pixels, views.given, views.views, views.count, views.left = at(twos), at(ones), 1, 4, left
+    views.residuals, views.weights, views.valid, views.costs = out, out + 64, at(valid), out + 128
     library.camtorch_views(views)
     yield "camtorch_views", made[:8], [pixel - 2 for pixel in pixels]
 
-    system, shared = _numbers(4, 2), _numbers(0)
-    solve = structs.Steps(
-        view=at(system), shared=at(shared), damping=at(shared), problems=1, views=1, width=1, left=left
-    )
-    solve.of_views, solve.of_shared, solve.rest = out, out + 8, out + 16
+    system = _numbers(4, 2)
+    solve = structs.Steps(view=at(system), shared=at(zeros), damping=at(zeros), problems=1, views=1, width=1)
+    solve.of_views, solve.of_shared, solve.rest, solve.left = out, out + 8, out + 16, left
     library.camtorch_steps(solve)
     yield "camtorch_steps", (made[0], made[2]), (-0.5, 0)
 
     poses = structs.Poses(cameras=at(camera), points=at(points), pixels=at(pixels), weights=at(ones), point_rows=1)
-    poses.row_count, poses.count, poses.task, poses.loss, poses.left = (
-        1,
-        4,
-        structs.REFINED,
-        structs.LEAST_SQUARES,
-        left,
-    )
+    poses.row_count, poses.count, poses.task, poses.steps, poses.damping = 1, 4, structs.REFINED, 1, 1
     poses.rotations, poses.translations, poses.valid, poses.costs = at(unit), at(zeros), at(valid), out
-    poses.next, poses.steps, poses.damping = next_, 1, 1
+    poses.next, poses.left = next_, left
     library.camtorch_poses(poses)
     yield "camtorch_poses", (made[0], *unit), (0, 1, 0, 0, 0, 1, 0, 0, 0, 1)
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from camtorch.native.build import LIBRARY, REASON, VARIANTS, checksum, switched_off
 from camtorch.native.known import wrong
-from camtorch.native.structs import LAYOUT, Library
+from camtorch.native.structs import CHECKSUM, STRUCTS, Library
+from camtorch.native.structure import layout
 
 _HERE = Path(__file__).resolve().parent
 _BUILD = "python -m camtorch.native.build"
@@ -33,11 +34,14 @@ def _find() -> tuple[Library | None, str]:
         library = Library(str(path))
     except OSError as error:
         return None, f"not loaded ({error}); `{_BUILD}` builds it again; {_SLOWER}"
-    here, built_from, layout = checksum(), *(_number(library, name) for name in ("camtorch_sources", "camtorch_layout"))
+    here, (built_from, laid_out) = (
+        checksum(),
+        (_number(library, name) for name in ("camtorch_sources", "camtorch_layout")),
+    )
     if here is not None and built_from != here:  # None if a package leaves the sources out
         why = "not used (built from other sources than those beside it)"
         return None, f"{why}; `{_BUILD}` or `pip install -e .` builds it again; {_SLOWER}"
-    if layout != LAYOUT:
+    if laid_out != layout(CHECKSUM, STRUCTS):
         why = "not used (its structures, values or calls are not those of camtorch/native/structs.py)"
         return None, f"{why}; `{_HEADERS}` writes that file, `{_BUILD}` builds the library again; {_SLOWER}"
     library.declare()
@@ -82,8 +86,7 @@ def warn_if_missing() -> None:
 @functools.cache
 def loaded() -> Library:
     """Return the library, for calls that are made only if there is one."""
-    found = library()
-    if found is None:
+    if (found := library()) is None:
         raise RuntimeError(f"camtorch: the native sampler must be there for compiled calls; got none: it is {state()}")
     return found
 

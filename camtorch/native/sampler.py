@@ -9,34 +9,16 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from camtorch.native import memory
+from camtorch.native import memory, structs
 from camtorch.native.library import loaded
-from camtorch.native.structs import (
-    BICUBIC,
-    BILINEAR,
-    BOOL,
-    BORDER,
-    BYTES1,
-    BYTES2,
-    BYTES4,
-    BYTES8,
-    FLOAT32,
-    NEAREST,
-    REFLECTION,
-    SCRATCH,
-    UINT8,
-    UINT16,
-    ZEROS,
-    Classification,
-    Job,
-)
 from camtorch.values.dtypes import as_pixels
 from camtorch.values.threads import spread, thread_count
 
-_MODES = {"nearest": NEAREST, "bilinear": BILINEAR, "bicubic": BICUBIC}
-PADDINGS = {"zeros": ZEROS, "border": BORDER, "reflection": REFLECTION}
-_TYPES = {torch.uint8: UINT8, torch.bool: BOOL, torch.uint16: UINT16, torch.float32: FLOAT32}
-_BYTES = {1: BYTES1, 2: BYTES2, 4: BYTES4, 8: BYTES8}
+_MODES = {"nearest": structs.NEAREST, "bilinear": structs.BILINEAR, "bicubic": structs.BICUBIC}
+PADDINGS = {"zeros": structs.ZEROS, "border": structs.BORDER, "reflection": structs.REFLECTION}
+_TYPES = {torch.uint8: structs.UINT8, torch.bool: structs.BOOL, torch.uint16: structs.UINT16}
+_TYPES[torch.float32] = structs.FLOAT32
+_BYTES = {1: structs.BYTES1, 2: structs.BYTES2, 4: structs.BYTES4, 8: structs.BYTES8}
 _TILE = 1 << 15  # pixels of a tile, some 0.1 ms a channel
 _WORTH = 8  # pixels that may be copied for one that is made: interpolated one by one they would take longer
 
@@ -87,7 +69,7 @@ class Call:
         self._tiles = 0 if 0 in result.shape else tiles_of(result)
         if not self._tiles:
             return
-        job = self._job = Job()
+        job = self._job = structs.Job()
         describe(job, images, result, mode, padding, fill)
         if grid is not None:
             job.grid, job.grid_is_double = job.keep(grid), grid.dtype == torch.float64
@@ -108,7 +90,7 @@ class Call:
         if self._layout is not None:
             images = _copied(images, self._layout)
         made = torch.empty(result.shape, dtype=result.dtype, device="cpu") if self._is_copied else result
-        job = Job.from_buffer_copy(self._job)  # of this call alone, for several threads may be calling
+        job = structs.Job.from_buffer_copy(self._job)  # of this call alone, for several threads may be calling
         job.source, job.result = images.data_ptr(), made.data_ptr()
         native, threads = loaded(), min(thread_count(), self._tiles)
         if threads == 1:
@@ -123,7 +105,7 @@ def _copied(images: Tensor, layout: torch.memory_format) -> Tensor:
     return source.clone(memory_format=layout).expand(images.shape)
 
 
-def describe(job: Job, images: Tensor, result: Tensor, mode: str, padding: str, fill: Sequence[float]) -> None:
+def describe(job: structs.Job, images: Tensor, result: Tensor, mode: str, padding: str, fill: Sequence[float]) -> None:
     """Write into a job what arguments of `Call` have in common: all but images and positions."""
     job.source_strides[:], job.result_strides[:] = images.stride(), result.stride()
     job.count, job.channels, job.height, job.width = result.shape
@@ -200,8 +182,8 @@ def classify(
     """
     count, rows, columns = nodes.shape[0], nodes.shape[2] - 5, nodes.shape[3] - 5
     cells = torch.empty(count, rows, columns, dtype=torch.int32, device="cpu")
-    scratch = torch.empty(SCRATCH * (columns + 8), dtype=torch.float32, device="cpu")
-    asked = Classification()
+    scratch = torch.empty(structs.SCRATCH * (columns + 8), dtype=torch.float32, device="cpu")
+    asked = structs.Classification()
     asked.nodes, asked.mapped, asked.rim, asked.cells, asked.scratch = (
         tensor.data_ptr() for tensor in (nodes, mapped, rim, cells, scratch)
     )

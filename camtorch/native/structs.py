@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from ctypes import CDLL, POINTER, c_char_p, c_double, c_int32, c_int64, c_uint32, c_void_p
+from ctypes import POINTER, c_char_p, c_double, c_int32, c_int64, c_uint32, c_void_p
 
-from camtorch.native.structure import Numbers, Struct
+from camtorch.native.structure import Calls, Numbers, Struct
 
-LAYOUT = 2036280785
+CHECKSUM = 1830311450
 
 UINT8 = 0
 BOOL = 1
@@ -112,7 +112,7 @@ CAUCHY = 2
 
 
 class Agreement(Struct):
-    """`Agreement` of consensus.h."""
+    """`Agreement` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -148,7 +148,7 @@ class Agreement(Struct):
 
 
 class Job(Struct):
-    """`Job` of sampler.h."""
+    """`Job` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -216,7 +216,7 @@ class Job(Struct):
 
 
 class Classification(Struct):
-    """`Classification` of sampler.h."""
+    """`Classification` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -258,7 +258,7 @@ class Classification(Struct):
 
 
 class Part(Struct):
-    """`Part` of geometry.h."""
+    """`Part` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -282,7 +282,7 @@ class Part(Struct):
 
 
 class Cameras(Struct):
-    """`Cameras` of geometry.h."""
+    """`Cameras` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -330,7 +330,7 @@ class Cameras(Struct):
 
 
 class Domain(Struct):
-    """`Domain` of geometry.h."""
+    """`Domain` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -386,7 +386,7 @@ class Domain(Struct):
 
 
 class Rows(Struct):
-    """`Rows` of geometry.h."""
+    """`Rows` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -422,7 +422,7 @@ class Rows(Struct):
 
 
 class Move(Struct):
-    """`Move` of geometry.h."""
+    """`Move` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -462,7 +462,7 @@ class Move(Struct):
 
 
 class Lattices(Struct):
-    """`Lattices` of geometry.h."""
+    """`Lattices` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -486,7 +486,7 @@ class Lattices(Struct):
 
 
 class Turned(Struct):
-    """`Turned` of geometry.h."""
+    """`Turned` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -508,7 +508,7 @@ class Turned(Struct):
 
 
 class Together(Struct):
-    """`Together` of geometry.h."""
+    """`Together` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -532,7 +532,7 @@ class Together(Struct):
 
 
 class Draws(Struct):
-    """`Draws` of draws.h."""
+    """`Draws` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -604,7 +604,7 @@ class Draws(Struct):
 
 
 class Poses(Struct):
-    """`Poses` of poses.h."""
+    """`Poses` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -664,7 +664,7 @@ class Poses(Struct):
 
 
 class Views(Struct):
-    """`Views` of poses.h."""
+    """`Views` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -714,7 +714,7 @@ class Views(Struct):
 
 
 class Steps(Struct):
-    """`Steps` of poses.h."""
+    """`Steps` of the headers."""
 
     __slots__ = ()
     _fields_ = (
@@ -743,9 +743,31 @@ class Steps(Struct):
     left: int | None
 
 
-class Library(CDLL):
-    """The compiled library; `declare` gives its calls their types."""
+STRUCTS = Agreement, Job, Classification, Part, Cameras, Domain, Rows, Move, Lattices, Turned, Together, Draws, Poses, Views, Steps
 
+
+class Library(Calls):
+    """The compiled library."""
+
+    types = {
+        "camtorch_sample": (c_int32, [POINTER(Job)]),
+        "camtorch_classify": (c_int32, [POINTER(Classification)]),
+        "camtorch_geometry": (c_int64, [POINTER(Rows)]),
+        "camtorch_moves": (c_int64, [POINTER(Move)]),
+        "camtorch_lattices": (c_int64, [POINTER(Lattices)]),
+        "camtorch_domain": (None, [POINTER(Domain)]),
+        "camtorch_draws": (c_int64, [POINTER(Draws)]),
+        "camtorch_consensus": (None, [POINTER(Agreement)]),
+        "camtorch_poses": (None, [POINTER(Poses)]),
+        "camtorch_views": (None, [POINTER(Views)]),
+        "camtorch_steps": (None, [POINTER(Steps)]),
+        "camtorch_use": (c_int32, [c_char_p]),
+        "camtorch_sources": (c_uint32, []),
+        "camtorch_layout": (c_uint32, []),
+        "camtorch_variant": (c_char_p, []),
+        "camtorch_turns": (None, [c_void_p, c_int64, c_void_p, c_int64]),
+        "camtorch_together": (c_int64, [POINTER(Together)]),
+    }
     camtorch_sample: Callable[[Job], int]
     camtorch_classify: Callable[[Classification], int]
     camtorch_geometry: Callable[[Rows], int]
@@ -763,28 +785,3 @@ class Library(CDLL):
     camtorch_variant: Callable[[], bytes]
     camtorch_turns: Callable[[int, int, int, int], None]
     camtorch_together: Callable[[Together], int]
-
-    def declare(self) -> None:
-        """Give each call the types of its result and of what it takes."""
-        types = {
-            "camtorch_sample": (c_int32, [POINTER(Job)]),
-            "camtorch_classify": (c_int32, [POINTER(Classification)]),
-            "camtorch_geometry": (c_int64, [POINTER(Rows)]),
-            "camtorch_moves": (c_int64, [POINTER(Move)]),
-            "camtorch_lattices": (c_int64, [POINTER(Lattices)]),
-            "camtorch_domain": (None, [POINTER(Domain)]),
-            "camtorch_draws": (c_int64, [POINTER(Draws)]),
-            "camtorch_consensus": (None, [POINTER(Agreement)]),
-            "camtorch_poses": (None, [POINTER(Poses)]),
-            "camtorch_views": (None, [POINTER(Views)]),
-            "camtorch_steps": (None, [POINTER(Steps)]),
-            "camtorch_use": (c_int32, [c_char_p]),
-            "camtorch_sources": (c_uint32, []),
-            "camtorch_layout": (c_uint32, []),
-            "camtorch_variant": (c_char_p, []),
-            "camtorch_turns": (None, [c_void_p, c_int64, c_void_p, c_int64]),
-            "camtorch_together": (c_int64, [POINTER(Together)]),
-        }
-        for name, (result, takes) in types.items():
-            call = getattr(self, name)
-            call.restype, call.argtypes = result, takes

@@ -1,10 +1,10 @@
-"""The base of the structures that C reads."""
+"""The bases of the structures that C reads, and of the library."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from ctypes import Array, Structure, addressof
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Iterable, Iterator
+from ctypes import CDLL, Array, Structure, addressof, sizeof
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -34,3 +34,24 @@ class Struct(Structure):
             self._kept.append(owner)
         except AttributeError:
             self._kept = [owner]
+
+
+class Calls(CDLL):
+    """A library whose calls refuse other structures than their own, after `declare`."""
+
+    types: ClassVar[dict[str, tuple[Any, list[Any]]]]
+
+    def declare(self) -> None:
+        """Give each call the type of its result and those that it takes."""
+        for name, (result, takes) in self.types.items():
+            call = getattr(self, name)
+            call.restype, call.argtypes = result, takes
+
+
+def layout(checksum: int, structs: Iterable[type[Struct]]) -> int:
+    """Return what `camtorch_layout` of a library with such names, types and values returns if fields lie like here."""
+    for struct in structs:
+        fields = (getattr(struct, name) for name, *_ in struct._fields_)
+        for number in (sizeof(struct), *(number for field in fields for number in (field.offset, field.size))):
+            checksum = (checksum ^ number) * 16777619 & 0xFFFFFFFF
+    return checksum

@@ -16,21 +16,6 @@ from torch import Tensor
 from camtorch.native import memory, structs
 from camtorch.native.library import loaded
 from camtorch.native.sampler import PADDINGS
-from camtorch.native.structs import (
-    LEFT_FROM,
-    LEFT_TO,
-    POSITIONS,
-    PROJECT,
-    PROJECT_VJP,
-    SCRATCH,
-    SQUARES,
-    STEP,
-    UNPROJECT,
-    UNPROJECT_VJP,
-    Job,
-    Move,
-    Rows,
-)
 from camtorch.projection.native_cameras import Native, address
 from camtorch.values.threads import spread, thread_count
 
@@ -44,10 +29,11 @@ def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     cameras, count, _ = points.shape
     pixels = _empty((2, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
-    call = Rows()
+    call = structs.Rows()
     call.rows, call.row_strides[:], call.valid = points.data_ptr(), points.stride(), valid.data_ptr()
     call.results, call.result_strides[:] = pixels.data_ptr(), (count, 1, cameras * count)
-    _call_and_follow(native, cameras, count, PROJECT, call)
+    call.direction = structs.PROJECT
+    _call_and_follow(native, cameras, count, call)
     return pixels, valid
 
 
@@ -66,11 +52,11 @@ def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojecte
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
     solution = _empty((2, cameras, count), native.dtype) if keeps else None
     native.add_table()
-    call = Rows()
+    call = structs.Rows()
     call.rows, call.row_strides[:], call.valid = pixels.data_ptr(), pixels.stride(), valid.data_ptr()
     call.results, call.result_strides[:] = rays.data_ptr(), (count, 1, cameras * count)
-    call.solution = address(solution)
-    _call_and_follow(native, cameras, count, UNPROJECT, call)
+    call.solution, call.direction = address(solution), structs.UNPROJECT
+    _call_and_follow(native, cameras, count, call)
     return Unprojected(rays, valid, solution)
 
 
@@ -81,9 +67,9 @@ def project_vjp(
 
     `cotangents` are those of pixels, (2, C, N), of any strides.
     """
-    call = Rows()
-    call.rows, call.row_strides[:] = points.data_ptr(), points.stride()
-    return _vjp(native, PROJECT_VJP, call, points.shape[:2], cotangents, 3 * want_points, want_parameters)
+    call = structs.Rows()
+    call.rows, call.row_strides[:], call.direction = points.data_ptr(), points.stride(), structs.PROJECT_VJP
+    return _vjp(native, call, points.shape[:2], cotangents, 3 * want_points, want_parameters)
 
 
 def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[Tensor, Tensor]:
@@ -96,12 +82,12 @@ def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[
     sums = torch.zeros(2, cameras, count, (4 + native.parameters) * by_camera, dtype=torch.float64, device="cpu")
     tile = 1 if by_camera else _TILE
     for one, by, to in zip(torch.eye(2, dtype=native.dtype, device="cpu"), by_points, sums, strict=True):
-        call = Rows()
-        call.rows, call.row_strides[:] = points.data_ptr(), points.stride()
+        call = structs.Rows()
+        call.rows, call.row_strides[:], call.direction = points.data_ptr(), points.stride(), structs.PROJECT_VJP
         call.results, call.result_strides[:] = by.data_ptr(), by.stride()
         call.cotangents, call.cotangent_strides[:] = one.data_ptr(), (0, 0, 1)
         call.sums = to.data_ptr() if by_camera else None
-        _call(native, cameras, count, PROJECT_VJP, call, tile)
+        _call(native, cameras, count, call, tile)
     return by_points.movedim(0, 2), sums.movedim(0, 2)
 
 
@@ -109,19 +95,13 @@ def unproject_vjp(
     native: Native, valid: Tensor, solution: Tensor, cotangents: Tensor, want_pixels: bool, want_parameters: bool
 ) -> tuple[Tensor | None, Tensor | None]:
     """Return the cotangents of pixels (C, N, 2), and of the cameras, for results of `unproject`; see `project_vjp`."""
-    call = Rows()
-    call.valid, call.solution = valid.data_ptr(), solution.data_ptr()
-    return _vjp(native, UNPROJECT_VJP, call, valid.shape, cotangents, 2 * want_pixels, want_parameters)
+    call = structs.Rows()
+    call.valid, call.solution, call.direction = valid.data_ptr(), solution.data_ptr(), structs.UNPROJECT_VJP
+    return _vjp(native, call, valid.shape, cotangents, 2 * want_pixels, want_parameters)
 
 
 def _vjp(
-    native: Native,
-    direction: int,
-    call: Rows,
-    shape: torch.Size,
-    cotangents: Tensor,
-    size: int,
-    want_parameters: bool,
+    native: Native, call: structs.Rows, shape: torch.Size, cotangents: Tensor, size: int, want_parameters: bool
 ) -> tuple[Tensor | None, Tensor | None]:
     """Return the cotangents of rows (*shape, size), None if the size is 0, and of the cameras, None if not wanted."""
     if cotangents.shape[1:] != shape:  # C would read elsewhere
@@ -135,7 +115,7 @@ def _vjp(
         call.results, call.result_strides[:] = results.data_ptr(), results.stride()
     component, *row = cotangents.stride()
     call.cotangents, call.cotangent_strides[:], call.sums = cotangents.data_ptr(), (*row, component), address(sums)
-    _call(native, cameras, count, direction, call)
+    _call(native, cameras, count, call)
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
@@ -156,18 +136,18 @@ class Lattices:
         padding: str,
         cameras: int,
         first_row: int = 0,
-        move: Move | None = None,
+        move: structs.Move | None = None,
         room: Callable[[int], Tensor] = lambda count: torch.empty(count, dtype=torch.uint8, device="cpu"),
     ):
         dtype, count, is_double = probes.dtype, probes.shape[1], probes.dtype == torch.float64
-        n, m = (-(-side // STEP) for side in size)
+        n, m = (-(-side // structs.STEP) for side in size)
         nodes, self._most = (n + 5) * (m + 5), cameras * n * m
         # the first (n + 5) (m + 5) nodes are those of the lattice, the others are on the rim
         self.nodes = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
         self.cells = torch.empty(cameras, n, m, dtype=torch.int32, device="cpu")
         # exact positions, of which parts are written; nodes in float32; scratch; valid flags of the probes
-        squares = 2 * SQUARES * self._most
-        sizes = squares * dtype.itemsize, 8 * cameras * nodes * is_double, 4 * SCRATCH * cameras * (m + 8)
+        squares = 2 * structs.SQUARES * self._most
+        sizes = squares * dtype.itemsize, 8 * cameras * nodes * is_double, 4 * structs.SCRATCH * cameras * (m + 8)
         self._room, self.counters = room(sum(sizes) + cameras * count), (c_int64 * 2)()
         exact, narrow, scratch, valid = accumulate(sizes, initial=self._room.data_ptr())
         made, (next_camera, used) = structs.Lattices(), (addressof(self.counters) + 8 * i for i in range(2))
@@ -177,7 +157,7 @@ class Lattices:
         else:
             made.move = move
         move, cells = made.move, made.cells
-        move.cameras, move.form, (move.height, move.width) = cameras, POSITIONS, source_size
+        move.cameras, move.form, (move.height, move.width) = cameras, structs.POSITIONS, source_size
         made.keep(probes)
         move.rows, move.row_strides[:] = rows_of(probes)
         move.results, move.result_strides[:], move.valid = self.nodes.data_ptr(), (2 * count, 1, count), valid
@@ -189,20 +169,20 @@ class Lattices:
         cells.tolerance, cells.padding = tolerance, PADDINGS[padding]
         self.struct, self._is_double = made, is_double
 
-    def lay(self, job: Job) -> None:
+    def lay(self, job: structs.Job) -> None:
         """Have images find the lattices, which are in float for them."""
         made, double, (_, n, m) = self.struct, self._is_double, self.cells.shape
         plane = (n + 5) * (m + 5)
         job.nodes = made.narrow if double else made.cells.nodes
         job.node_strides[:] = (2 * plane, plane) if double else tuple(made.cells.node_strides)
         job.cells, job.cell_stride, job.rows, job.columns = made.cells.cells, n * m, n, m
-        job.exact, job.exact_stride = made.exact, SQUARES * self._most * (1 + double)
+        job.exact, job.exact_stride = made.exact, structs.SQUARES * self._most * (1 + double)
 
     def results(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return `nodes` (C, 2, n + 5, m + 5), `cells`, and `exact` (2, K, 8, 8), NaN if there is no position."""
-        (cameras, n, m), dtype, most = self.cells.shape, self.nodes.dtype, self._most
+        (cameras, n, m), dtype, most, step = self.cells.shape, self.nodes.dtype, self._most, structs.STEP
         nodes = self.nodes.as_strided((cameras, 2, n + 5, m + 5), (*self.nodes.stride()[:2], m + 5, 1))
-        exact = self._room[: 2 * SQUARES * most * dtype.itemsize].view(dtype).view(2, most, STEP, STEP)
+        exact = self._room[: 2 * step * step * most * dtype.itemsize].view(dtype).view(2, most, step, step)
         return nodes, self.cells, exact[:, : self.counters[1]].clone()
 
 
@@ -217,7 +197,7 @@ class Between:
         self.cameras = max(start.cameras, end.cameras, count)
         start.add_table()
         self._size = size
-        self._move = move = Move()
+        self._move = move = structs.Move()
         move.from_, move.to, move.turns, move.cameras = start.pointer, end.pointer, address(turns), self.cameras
         move.turn_strides[:] = strides[0] if count > 1 else 0, *strides[-2:]
 
@@ -230,7 +210,7 @@ class Between:
         count = pixels.shape[1]
         result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
         valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
-        call, counters = Move.from_buffer_copy(self._move), _kept.counters
+        call, counters = structs.Move.from_buffer_copy(self._move), _kept.counters
         call.form, (call.height, call.width), call.count, call.tile = form, self._size, count, _TILE
         call.rows, call.row_strides[:] = rows_of(pixels)
         call.results, call.result_strides[:], call.valid = result.data_ptr(), (2 * count, 2, 1), valid.data_ptr()
@@ -262,9 +242,9 @@ def run_and_follow(
         counters[:] = [0, 0]
         spread(lambda: left.append(run(call)), threads)  # noqa: B023 (called at once)
         flags = functools.reduce(operator.or_, left)
-        if not flags & (LEFT_FROM | LEFT_TO):
+        if not flags & (structs.LEFT_FROM | structs.LEFT_TO):
             return flags
-        for flag, native in ((LEFT_FROM, start), (LEFT_TO, end)):
+        for flag, native in ((structs.LEFT_FROM, start), (structs.LEFT_TO, end)):
             if flags & flag:
                 native.follow()
 
@@ -302,11 +282,11 @@ def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
     return torch.empty(size, dtype=dtype, device="cpu")
 
 
-def _call(native: Native, cameras: int, count: int, direction: int, call: Rows, tile: int = _TILE) -> int:
+def _call(native: Native, cameras: int, count: int, call: structs.Rows, tile: int = _TILE) -> int:
     """Call the compiled geometry with rows, their results and what belongs to them."""
     if cameras != native.cameras:  # C would read elsewhere
         raise ValueError(f"rows must be of {native.cameras} cameras; got those of {cameras}")
-    call.cameras, call.count, call.tile, call.direction = native.pointer, count, tile, direction
+    call.cameras, call.count, call.tile = native.pointer, count, tile
     run, points = loaded().camtorch_geometry, cameras * count
     if points < _SHARED:
         return run(call) if points else 0
@@ -317,8 +297,8 @@ def _call(native: Native, cameras: int, count: int, direction: int, call: Rows, 
     return sum(left)
 
 
-def _call_and_follow(native: Native, cameras: int, count: int, direction: int, call: Rows) -> None:
+def _call_and_follow(native: Native, cameras: int, count: int, call: structs.Rows) -> None:
     """Call the geometry, and again with the limits of each azimuth if a point lies so far out that they decide."""
-    if _call(native, cameras, count, direction, call):
+    if _call(native, cameras, count, call):
         native.follow()
-        _call(native, cameras, count, direction, call)
+        _call(native, cameras, count, call)

@@ -19,7 +19,7 @@ from camtorch.evaluate.known import are_free
 from camtorch.native.library import warn_if_missing
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.rows import CameraRows, Direction, unusable
-from camtorch.values.arguments import Numbers, as_points, warn
+from camtorch.values.arguments import Numbers, as_points, present, warn
 
 _MANY = 1_000_000  # points of a call that a user waits for
 
@@ -119,8 +119,7 @@ class _Native(Function):
     def forward(
         ctx: Any, rows: Tensor, intrinsics: Tensor, distortion: Tensor, cameras: CameraRows, direction: Direction
     ) -> tuple[Tensor, Tensor]:
-        made = cameras.native
-        assert made is not None  # the caller checked it
+        made = present(cameras.native, "compiled code for the cameras")
         planes, valid, kept = direction.native_keeping(made, rows)
         ctx.save_for_backward(rows, intrinsics, distortion, *kept)
         ctx.cameras, ctx.direction = cameras, direction

@@ -15,7 +15,6 @@ from camtorch import optics
 from camtorch.evaluate.kept import Kept
 from camtorch.native import structs
 from camtorch.native.library import library, loaded
-from camtorch.native.structs import AZIMUTHS, EXTENT, MOST_DEGREE, MOST_PARTS, MOST_RADII, RADII, Part
 from camtorch.optics.backprojection import FURTHEST
 from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.values.arguments import columns
@@ -31,9 +30,9 @@ if TYPE_CHECKING:
 class Plan:
     """The properties that all cameras of a model and a number of coefficients have in common."""
 
-    def __init__(self, chart: Chart, lens: Lens, parts: Sequence[Part], coefficients: Sequence[Tensor]):
+    def __init__(self, chart: Chart, lens: Lens, parts: Sequence[structs.Part], coefficients: Sequence[Tensor]):
         """Make the plan of optics whose coefficients are columns, whatever their values."""
-        self.parts, self.count = (Part * len(parts))(*parts), len(parts)
+        self.parts, self.count = (structs.Part * len(parts))(*parts), len(parts)
         parameters = (*chart.parameters, *lens.parameters)
         self.parameters = len(parameters)
         places = {id(c): i for i, c in enumerate(coefficients)}
@@ -45,7 +44,7 @@ class Plan:
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
         # a radial factor has so many numbers that its fold is not found by a root
-        self.is_long = any(part.factor and part.n + part.m > MOST_DEGREE for part in parts)
+        self.is_long = any(part.factor and part.n + part.m > structs.MOST_DEGREE for part in parts)
         self.fixed_ends: dict[torch.dtype, tuple[float, float]] = {}  # if all cameras have them, after a call of `ends`
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
@@ -141,7 +140,7 @@ class Lenses:
                 made.constants, made.constant_count = self._keep_columns(constants, torch.float64), len(constants)
             factor = chart.factor(chart.parameters) if isinstance(chart, optics.Inverted) else lens.radial
             if factor is not None:
-                many = len(factor.parameters) > MOST_DEGREE
+                many = len(factor.parameters) > structs.MOST_DEGREE
                 fold = factor.closed_fold() if many and factor.fold is None else factor.fold
                 made.folds = None if fold is None else self._keep(fold.expand(self.cameras, 1))
         return made
@@ -172,14 +171,14 @@ class Lenses:
         has_table = tables and plan.has_factor  # made now, as pixels will follow
         start, step = self._new(len(names) + TABLE_WIDTH * has_table), self.cameras * self.dtype.itemsize
         wanted = {name: start + step * i for i, name in enumerate([*names, *["table"] * has_table])}
-        radii = None if plan.is_radial else plan.radii(lambda: self._optics()[0], MOST_RADII, self._k)
+        radii = None if plan.is_radial else plan.radii(lambda: self._optics()[0], structs.MOST_RADII, self._k)
         self._ask(wanted if radii is None else wanted | {"radii": self._keep(radii)})
         for name, place in wanted.items():
             setattr(self.struct, name, place)
 
     def radii_wanted(self) -> dict[str, Tensor]:
         """Return the radii on which lenses are followed, by their names in a request."""
-        names = {"radii": MOST_RADII, "even": RADII, "coarse": RADII // 2}
+        names = {"radii": structs.MOST_RADII, "even": structs.RADII, "coarse": structs.RADII // 2}
         chart, like = self._optics()[0], self._k.double()
         return {name: self.plan.radii(lambda: chart, count, like) for name, count in names.items()}
 
@@ -195,7 +194,7 @@ class Lenses:
         """Return the addresses of the limits of each azimuth and of its extent, made if a point lies far out."""
         struct = self.struct
         if struct.limits2 is None:
-            wanted = {"limits2": self._new(AZIMUTHS), "extent": self._new(EXTENT)}
+            wanted = {"limits2": self._new(structs.AZIMUTHS), "extent": self._new(structs.EXTENT)}
             known = ((name, getattr(struct, name)) for name in ("image_circle_sq", "stagewise"))
             wanted |= {name: place for name, place in known if place is not None}
             wanted |= {name: self._keep(radii) for name, radii in self.radii_wanted().items()}
@@ -213,7 +212,7 @@ class Lenses:
             self.followed()
         widths = dict.fromkeys(("safe_radius_sq", "image_radius_sq", "image_circle_sq", "stagewise"), 1)
         made = {}
-        for name, width in {**widths, "table": TABLE_WIDTH, "limits2": AZIMUTHS}.items():
+        for name, width in {**widths, "table": TABLE_WIDTH, "limits2": structs.AZIMUTHS}.items():
             if (place := getattr(self.struct, name)) is not None:
                 dtype = torch.bool if name == "stagewise" else self.dtype
                 memory = (ctypes.c_char * (self.cameras * width * dtype.itemsize)).from_address(place)
@@ -303,11 +302,11 @@ def _plan_of(optics_of: Optics, k: Tensor) -> Plan | None:
     return None if parts is None else Plan(chart, lens, parts, given)
 
 
-def codes(chart: Chart, lens: Lens) -> list[Part] | None:
+def codes(chart: Chart, lens: Lens) -> list[structs.Part] | None:
     """Return the parts of chart and lens, or None if one part has no code."""
     parts = [_chart(chart), *map(_stage, lens.stages)]
     known = [part for part in parts if part is not None]
-    return known if len(known) == len(parts) <= MOST_PARTS else None
+    return known if len(known) == len(parts) <= structs.MOST_PARTS else None
 
 
 def _code(part: Chart | Stage | RadialFactor | type[RadialFactor]) -> int | None:
@@ -315,14 +314,14 @@ def _code(part: Chart | Stage | RadialFactor | type[RadialFactor]) -> int | None
     return vars(part if isinstance(part, type) else type(part)).get("code")
 
 
-def _chart(chart: Chart) -> Part | None:
+def _chart(chart: Chart) -> structs.Part | None:
     flags = 0
     if type(chart) is optics.Transverse:
         chart, flags = chart.chart, structs.TRANSVERSE
     kind = _code(chart)
     if kind is None:
         return None
-    part = Part(kind=kind, flags=flags)
+    part = structs.Part(kind=kind, flags=flags)
     if isinstance(chart, optics.Unified):
         part.flags |= structs.HAS_XI * chart.has_xi | structs.HAS_BETA * chart.has_beta
         part.flags |= structs.HAS_ALPHA * (chart.fixed_alpha is None)
@@ -333,22 +332,22 @@ def _chart(chart: Chart) -> Part | None:
     return part
 
 
-def _stage(stage: Stage) -> Part | None:
+def _stage(stage: Stage) -> structs.Part | None:
     kind = _code(stage)
     if kind is not None and isinstance(stage, optics.Surface):
-        part = Part(kind=kind, flags=stage.order, n=stage.columns, m=stage.rows, constant=stage.behind)
+        part = structs.Part(kind=kind, flags=stage.order, n=stage.columns, m=stage.rows, constant=stage.behind)
         part.cells[:], part.centre[:] = stage.cells, stage.centre
         return part
     if kind is None or not isinstance(stage, optics.Planar):
-        return None if kind is None else Part(kind=kind)
+        return None if kind is None else structs.Part(kind=kind)
     flags = structs.TANGENTIAL * bool(stage.tangential) | structs.PRISM * bool(stage.prism)
-    part, radial = Part(kind=kind, flags=flags), stage.radial
+    part, radial = structs.Part(kind=kind, flags=flags), stage.radial
     if radial is None:
         return part
     part.factor, part.n = _code(radial) or 0, len(radial.parameters)
     if isinstance(radial, optics.Rational):
         part.n, part.m = len(radial.numerator.parameters), len(radial.denominator.parameters)
-        if part.n + part.m > MOST_DEGREE:
+        if part.n + part.m > structs.MOST_DEGREE:
             return None
     if isinstance(radial, optics.RadiusTable):
         part.n = len(radial.nodes)

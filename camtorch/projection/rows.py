@@ -18,7 +18,7 @@ from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.native_cameras import Native, native_of
 from camtorch.projection.ops import tables
-from camtorch.values.arguments import columns
+from camtorch.values.arguments import columns, present
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
@@ -79,8 +79,7 @@ class CameraRows:
         of_intrinsics, sums = sums[:, :4] if wanted[0] else None, sums[:, 4:]
         if not wanted[1]:
             return of_intrinsics, None
-        assert self.native is not None  # it gave the sums
-        plan = self.native.plan
+        plan = present(self.native, "compiled code, which gave the sums,").plan
         if plan.places is not None:
             whole = sums if plan.is_all else torch.zeros_like(self.k).index_add_(1, plan.places, sums)
             return of_intrinsics, whole

@@ -18,7 +18,7 @@ from camtorch.projection.native_cameras import Native
 from camtorch.projection.ops import search_in_place, search_open
 from camtorch.projection.rows import CameraRows, Direction, Traced, replace, to_mask
 from camtorch.projection.solve import search
-from camtorch.values.arguments import columns
+from camtorch.values.arguments import columns, present
 
 if TYPE_CHECKING:
     from camtorch.optics.lens import Lens
@@ -71,8 +71,7 @@ def _invert_stagewise(domain: Domain, u: Tensor, v: Tensor) -> Found:
 
 def _first_image(domain: Domain, u: Tensor, v: Tensor) -> tuple[Found, Tensor]:
     """Return the points that the stages after the first one send to (u, v), and a margin of the image's circle."""
-    rest = domain.lens.rest
-    assert rest is not None
+    rest = present(domain.lens.rest, "a later stage")
     within = domain.image_circle_sq - torch.addcmul(u * u, v, v)
     mask = to_mask(within)
     u, v = replace(mask, u, 0.0), replace(mask, v, 0.0)
@@ -81,9 +80,8 @@ def _first_image(domain: Domain, u: Tensor, v: Tensor) -> tuple[Found, Tensor]:
 
 def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
     r2 = torch.addcmul(u * u, v, v)
-    eps, radial, table = torch.finfo(u.dtype).eps, domain.lens.radial, domain.inverse
-    assert radial is not None  # a radial lens has both
-    assert table is not None
+    eps = torch.finfo(u.dtype).eps
+    radial, table = present(domain.lens.radial, "a radial factor"), present(domain.inverse, "a table")
     possible = times(table.most2, 1 + 8 * eps) - r2
     # points beyond the fold would never converge
     r2 = torch.minimum(replace(to_mask(possible), r2, 0.0), table.most2)
@@ -104,7 +102,7 @@ def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Found:
         a, b = a + da, b + db
         t = torch.addcmul(a * a, b, b)
         converged = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
-    assert converged is not None  # there are steps
+    converged = present(converged, "a step")
     return Found(a, b, torch.minimum(converged, reciprocal.abs()), torch.ones_like(a))
 
 
@@ -184,9 +182,8 @@ def _formula(
 
 def _keeping(native: Native, pixels: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
     rays, valid, solution = compiled.unproject(native, pixels, keeps=True)
-    assert solution is not None  # it is asked for
     # a copy, as the returned mask belongs to the caller
-    return rays, valid, (valid.clone(), solution)
+    return rays, valid, (valid.clone(), present(solution, "the solution"))
 
 
 UNPROJECT = Direction(_formula, compiled.unproject, _keeping, compiled.unproject_vjp, "pixels", 2)

@@ -33,6 +33,13 @@ Name = TypeVar("Name", bound=str)
 CLOSE = 0.5  # as difflib has it: size and image_size are
 
 
+def present(value: Result | None, what: str) -> Result:
+    """Return a value that its user has made sure of, which `python -O` checks as well."""
+    if value is None:
+        raise RuntimeError(f"camtorch: {what} must be there; got none")
+    return value
+
+
 def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Result]]:
     """Return a decorator that adds `hint` to a function's error about arguments that it does not have."""
 

@@ -27,24 +27,9 @@ from camtorch.evaluate.door import (
 from camtorch.evaluate.export import with_values
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import is_unknown
-from camtorch.native import memory
+from camtorch.native import memory, structs
 from camtorch.native.library import loaded
 from camtorch.native.sampler import Call, describe, is_quick, maker, takes, tiles_of
-from camtorch.native.structs import (
-    BOXES,
-    LEFT_BITS,
-    LEFT_FROM,
-    LEFT_LABELS,
-    LEFT_MOST,
-    LEFT_TO,
-    ON_IMAGE,
-    POSITIONS,
-    STEP,
-    Job,
-    Move,
-    Together,
-    Turned,
-)
 from camtorch.projection.compiled import Between, Lattices, run_and_follow
 from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.native_cameras import Native
@@ -77,7 +62,7 @@ _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are
 _STRIP = 1 << 21  # pixels of such a strip
 _FEW = 2  # tiles of an image that one thread makes alone
 _EVEN = 4  # samples a thread from which on it matters little that the last ones leave some threads idle
-_PIXELS = 1 << LEFT_BITS  # flags of what is left of pixels are times this
+_PIXELS = 1 << structs.LEFT_BITS  # flags of what is left of pixels are times this
 
 
 def route_of(warp: CameraPair, images: Tensor | None = None) -> Route:
@@ -334,7 +319,7 @@ def _coarse(size: tuple[int, int], dtype: torch.dtype) -> tuple[Tensor, tuple[in
 def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
     """Whether no image shrinks so far that a `MirrorWarp` would halve it; back: from the target to the source."""
     nodes, shape, step = _coarse(sizes[1], back.dtype)
-    places = back.rows(nodes, POSITIONS)[0].numpy().reshape(-1, *shape, 2)
+    places = back.rows(nodes, structs.POSITIONS)[0].numpy().reshape(-1, *shape, 2)
     seen: np.ndarray[Any, Any] = np.all(abs(places) <= 1, axis=-1)
     places = places * np.array([sizes[0][1] / 2, sizes[0][0] / 2], places.dtype)
     down, across = places[:, 1:] - places[:, :-1], places[:, :, 1:] - places[:, :, :-1]
@@ -391,7 +376,7 @@ class SampleCall:
     @classmethod
     def of(cls, form: SampleForm) -> SampleCall | None:
         """Return the call, or None where it does not do."""
-        n, m = (math.ceil(side / STEP) for side in form.sizes[1])
+        n, m = (math.ceil(side / structs.STEP) for side in form.sizes[1])
         if min(n, m) < FEWEST or (n + 5) * (m + 5) > MOST_KEPT:  # too small for a lattice, or too large to be kept
             return None
         return cls(form) if all(map(form.takes, form.values, form.hows)) else None
@@ -404,17 +389,17 @@ class SampleCall:
         with torch.inference_mode(False):
             self._lattices = Lattices(probes, sizes[1], sizes[0], form.tolerance, padding, count)
         images, moving = len(samplers), sum(how in ("pixels", "boxes") for how in form.hows)
-        self._jobs, pixels = (Job * images)(), (Move * moving)()
-        vectors = (Turned * (len(form.hows) - images - moving))()
-        call = self._call = Together(job_count=len(self._jobs), move_count=len(pixels), turned_count=len(vectors))
+        self._jobs, pixels = (structs.Job * images)(), (structs.Move * moving)()
+        vectors = (structs.Turned * (len(form.hows) - images - moving))()
+        call = self._call = structs.Together(job_count=images, move_count=moving, turned_count=len(vectors))
         call.jobs, call.moves, call.turned = (call.keep(array) for array in (self._jobs, pixels, vectors))
         jobs, moves, turns = iter(self._jobs), iter(pixels), iter(vectors)
         # the structure of each value, and whether it goes in as it is
-        self._slots = list[tuple[Job | Move | Turned, bool]]()
+        self._slots = list[tuple[structs.Job | structs.Move | structs.Turned, bool]]()
         self._makers = list[Callable[[], Tensor]]()  # of images
         self._tiles = 1
         for value, how in zip(form.values, form.hows, strict=True):
-            slot: Job | Move | Turned
+            slot: structs.Job | structs.Move | structs.Turned
             if isinstance(how, Sampler):
                 slot = job = next(jobs)
                 image = form.images(value)
@@ -428,7 +413,8 @@ class SampleCall:
                 slot, each = next(moves), 2 if how == "pixels" else 4
                 many = value.numel() // (each * count) if count else 0
                 slot.turn_strides[:], slot.cameras, (slot.height, slot.width) = (0, 3, 1), count, sizes[1]
-                slot.form, slot.count, slot.tile = ON_IMAGE if how == "pixels" else BOXES, many, max(many, 1)
+                slot.form = structs.ON_IMAGE if how == "pixels" else structs.BOXES
+                slot.count, slot.tile = many, max(many, 1)
                 slot.row_strides[:] = slot.result_strides[:] = each * many, each, 1
             else:
                 slot, width = next(turns), value.shape[-1]
@@ -478,10 +464,10 @@ class SampleCall:
         given, makers = [], iter(self._makers)  # pixels in the cameras' dtype, without gaps, for as long as the call
         for value, (slot, is_plain) in zip(values, self._slots, strict=True):
             valid = None
-            if isinstance(slot, Job):
+            if isinstance(slot, structs.Job):
                 result = next(makers)()
                 slot.source, slot.result = value.data_ptr(), result.data_ptr()
-            elif isinstance(slot, Turned):
+            elif isinstance(slot, structs.Turned):
                 result = value.clone()
                 slot.turn, slot.rows, slot.results = turn, value.data_ptr(), result.data_ptr()
             else:
@@ -502,17 +488,17 @@ class SampleCall:
         is_whole = threads == 1 or self._tiles <= _FEW or not jobs
         call.job_count, call.is_whole = jobs, is_whole
         while flags := native.camtorch_together(call):
-            if flags & LEFT_MOST:
+            if flags & structs.LEFT_MOST:
                 return None
             # of the lattice, else of the pixels, which go the other way
             left, (start, end) = (flags, (target, source)) if flags < _PIXELS else (flags // _PIXELS, (source, target))
-            if left & LEFT_FROM:
+            if left & structs.LEFT_FROM:
                 start.follow()
-            if left & LEFT_TO:
+            if left & structs.LEFT_TO:
                 end.follow()
             if flags >= _PIXELS:  # the images are made
                 call.job_count = 0
-                if left == LEFT_LABELS:
+                if left == structs.LEFT_LABELS:
                     for i in self._doubtful:
                         results[i] = None
                     break

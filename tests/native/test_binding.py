@@ -16,18 +16,10 @@ has_library = pytest.mark.skipif(not native_available(), reason="no compiled lib
 HERE = building._HERE
 
 
-def test_the_generated_file_is_what_the_headers_give_and_ctypes_lays_it_out_so():
+def test_the_generated_file_is_what_the_headers_give():
     if not (HERE / "dispatch.c").exists():
         pytest.skip("the sources are not here")
     assert (HERE / "structs.py").read_text() == headers.structs_py(), "run `python -m camtorch.native.headers`"
-    found = headers.read()
-    for name, fields in found.structs.items():
-        struct = getattr(structs, name)
-        places = [
-            (field.name, getattr(struct, field.name).offset, getattr(struct, field.name).size) for field in fields
-        ]
-        assert places == [(field.name, field.offset, field.size) for field in fields]
-        assert ctypes.sizeof(struct) == found.sizes[name]
 
 
 @has_library
