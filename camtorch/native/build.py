@@ -1,6 +1,6 @@
 """Compile the sampler: `python -m camtorch.native.build`. It needs a C compiler and no package, not even camtorch.
 
-`kernel.c` is compiled once for each kind of CPU, `dispatch.c` once; one shared library of both has no symbol of Python
+Each C file is compiled once for each kind of CPU, `dispatch.c` once; one shared library of all has no symbol of Python
 or torch, so it fits every version of them. It never has `-march=native`, as it may move to another machine, nor
 with `-ffast-math`, which links code that changes how the whole process rounds. A unit is compiled again if its text,
 without comments, that of its headers, the options or the compiler have changed; `CAMTORCH_VARIANTS=baseline` compiles
@@ -30,9 +30,6 @@ _SUFFIX = {"win32": "dll", "darwin": "dylib"}.get(sys.platform, "so")
 
 # two dots in its name, as tools that walk a package's modules would import a _sampler.so
 LIBRARY = f"_sampler.{_MACHINE}.{_SUFFIX}"
-
-# the files that are compiled for each kind of CPU
-_KERNELS = ("kernel.c", "geometry.c", "draws.c", "consensus.c", "poses.c", "views.c")
 
 # the file in which installation gives the reason, in one line, why it built no library
 REASON = "_sampler.reason.txt"
@@ -104,15 +101,16 @@ def build(directory: str | os.PathLike[str] | None = None, *, sources: str | os.
         Path(folder, "layout.h").write_text(runpy.run_path(str(_HERE / "headers.py"))["layout_h"](here), "utf-8")
         has = [*(f"-DHAS_{name.upper()}" for name in known if name != "baseline"), f"-DSOURCES={checksum(here)}u"]
         units = {"dispatch": [str(here / "dispatch.c"), "-I.", *has]}
-        for kernel in (here / name for name in _KERNELS if (here / name).exists()):
+        for kernel in sorted(set(here.glob("*.c")) - {here / "dispatch.c"}):
             units |= {f"{kernel.stem}_{name}": [str(kernel), *known[name], f"-DVARIANT={name}"] for name in known}
         objects = _objects(here) or Path(folder)
         version = _run([*command, "--version"], folder)
 
         def kept(name: str) -> Path:
             """Return where a unit's object is, or will be: its name has a checksum of all that it is made of."""
-            words = [*command, *_FLAGS, *units[name]]
-            text = _run([*words, "-E", "-P"], folder)  # without comments
+            source, *options = units[name]
+            words = [*command, *_FLAGS, *options]
+            text = _run([*words, "-E", "-P", source], folder)  # with its headers, without comments
             made_of = hashlib.sha256("\0".join([version, *words, text]).encode()).hexdigest()
             return objects / f"{name}.{made_of[:16]}.o"
 

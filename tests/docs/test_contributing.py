@@ -60,18 +60,24 @@ def take(page, root):
 def commands(page):
     """Those that a test can run: nothing is installed, and what takes minutes is left to the reader."""
     lines = [line for kind, _, text in steps(page) if kind == "bash" for line in text.splitlines()]
-    return [line for line in lines if re.match(r"pytest |python docs/|ruff ", line) and " -n 2" not in line]
+    run = r"pytest |python docs/|(CAMTORCH_VARIANTS=baseline )?python -m camtorch|ruff "
+    return [line for line in lines if re.match(run, line) and " -n 2" not in line]
 
 
 IN_ONE_PROCESS = """
-import pathlib, pytest, runpy, shlex, subprocess, sys
+import os, pathlib, pytest, runpy, shlex, subprocess, sys
 for line in sys.stdin.read().splitlines():
     print(line, flush=True)
     for program, *arguments in map(shlex.split, line.split(" && ")):
+        if "=" in program:
+            os.environ.update([program.split("=")])
+            program, *arguments = arguments
         if program == "pytest":
             assert pytest.main(arguments) == 0  # which it is not where nothing was selected
         elif program == "ruff":
             subprocess.run([sys.executable, "-m", program, *arguments], check=True)
+        elif arguments[0] == "-m":
+            subprocess.run([sys.executable, *arguments], check=True)
         else:
             sys.argv, sys.path[:0] = arguments, [str(pathlib.Path(arguments[0]).parent)]
             runpy.run_path(arguments[0], run_name="__main__")
@@ -85,7 +91,8 @@ def clone(tmp_path_factory):
     if listed.returncode:
         pytest.skip("this is no clone of the repository")
     root = tmp_path_factory.mktemp("clone")
-    native = [str(path.relative_to(ROOT)) for path in (ROOT / "camtorch" / "native").glob("*.so")]
+    made = itertools.chain.from_iterable((ROOT / "camtorch" / "native").glob(name) for name in ("*.so", "_objects/*.o"))
+    native = [str(path.relative_to(ROOT)) for path in made]
     for name in [*filter(None, listed.stdout.split("\0")), *native]:
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         if (ROOT / name).exists():
