@@ -72,15 +72,17 @@ class Call:
         job = self._job = structs.Job()
         describe(job, images, result, mode, padding, fill)
         if grid is not None:
-            job.grid, job.grid_is_double = job.keep(grid), grid.dtype == torch.float64
+            job.grid, job.grid_is_double = grid.data_ptr(), grid.dtype == torch.float64
             job.grid_strides[:] = _shared(grid), *grid.stride()[1:]
             if mapped is not None:
-                job.mapped, job.mapped_stride = job.keep(mapped.contiguous()), _shared(mapped)
+                mapped = mapped.contiguous()
+                job.mapped, job.mapped_stride = mapped.data_ptr(), _shared(mapped)
         if nodes is not None and cells is not None and exact is not None:
-            job.nodes, job.node_strides[:] = job.keep(nodes), (_shared(nodes), nodes.stride(1))
-            job.cells, job.cell_stride, (_, job.rows, job.columns) = job.keep(cells), _shared(cells), cells.shape
+            job.nodes, job.node_strides[:] = nodes.data_ptr(), (_shared(nodes), nodes.stride(1))
+            job.cells, job.cell_stride, (_, job.rows, job.columns) = cells.data_ptr(), _shared(cells), cells.shape
             if exact.shape[1]:
-                job.exact, job.exact_stride = job.keep(exact), exact.stride(0)
+                job.exact, job.exact_stride = exact.data_ptr(), exact.stride(0)
+        job.hold((grid, mapped, nodes, cells, exact))
 
     def __call__(self, images: Tensor, out: Tensor | None = None) -> Tensor:
         """Return the samples of images, written to `out` if given; that lies in memory as it did at first."""
@@ -110,7 +112,9 @@ def describe(job: structs.Job, images: Tensor, result: Tensor, mode: str, paddin
     job.source_strides[:], job.result_strides[:] = images.stride(), result.stride()
     job.count, job.channels, job.height, job.width = result.shape
     job.source_height, job.source_width = images.shape[-2:]
-    job.fill, job.fill_elements = map(job.keep, _fills(tuple(fill), images.dtype))
+    fills, elements = owners = _fills(tuple(fill), images.dtype)
+    job.hold(owners)
+    job.fill, job.fill_elements = fills.data_ptr(), elements.data_ptr()
     job.type = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
     job.mode, job.padding, job.tile_rows = _MODES[mode], PADDINGS[padding], _tile_rows(result.shape[3])
 

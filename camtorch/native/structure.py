@@ -30,10 +30,11 @@ class Struct(Structure):
 
     def hold(self, owner: object) -> None:
         """Have an owner of memory live as long as this structure. The first call comes before threads share it."""
-        try:
-            self._kept.append(owner)
-        except AttributeError:
+        kept = getattr(self, "_kept", None)
+        if kept is None:
             self._kept = [owner]
+        else:
+            kept.append(owner)
 
 
 class Calls(CDLL):

@@ -150,15 +150,16 @@ class Lattices:
         sizes = squares * dtype.itemsize, 8 * cameras * nodes * is_double, 4 * structs.SCRATCH * cameras * (m + 8)
         self._room, self.counters = room(sum(sizes) + cameras * count), (c_int64 * 2)()
         exact, narrow, scratch, valid = accumulate(sizes, initial=self._room.data_ptr())
-        made, (next_camera, used) = structs.Lattices(), (addressof(self.counters) + 8 * i for i in range(2))
-        made.first_row, made.narrow, made.exact, made.used = first_row, narrow if is_double else None, exact, used
+        made, next_camera = structs.Lattices(), addressof(self.counters)
+        made.hold(probes)
+        made.first_row, made.narrow, made.exact = first_row, narrow if is_double else None, exact
+        made.used = next_camera + 8
         if move is None:
             made.move.turn_strides[:] = 0, 1, 3
         else:
             made.move = move
         move, cells = made.move, made.cells
         move.cameras, move.form, (move.height, move.width) = cameras, structs.POSITIONS, source_size
-        made.keep(probes)
         move.rows, move.row_strides[:] = rows_of(probes)
         move.results, move.result_strides[:], move.valid = self.nodes.data_ptr(), (2 * count, 1, count), valid
         move.count, move.tile, move.next = count, count, next_camera

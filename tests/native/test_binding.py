@@ -1,16 +1,22 @@
 """Python and C share structures, values and calls, and a library that does not agree with Python is not used."""
 
+import ast
 import ctypes
 import importlib
 import inspect
+import re
 import shutil
 
 import pytest
+import torch
 from test_build import compiles
 
+import camtorch as ct
 from camtorch.native import build as building
 from camtorch.native import headers, known, structs
 from camtorch.native.library import library, native_available
+from camtorch.projection import compiled
+from camtorch.projection.evaluation import rows_of as camera_rows
 
 has_library = pytest.mark.skipif(not native_available(), reason="no compiled library is here")
 HERE = building._HERE
@@ -31,6 +37,24 @@ def test_a_wrong_field_a_wrong_length_and_a_wrong_structure_are_errors():
         rows.row_strides[:] = 1, 2
     with pytest.raises(ctypes.ArgumentError):
         library().camtorch_views(rows)
+
+
+def test_no_guard_of_a_call_goes_with_python_minus_o():
+    files = [path for path in HERE.parent.rglob("*.py") if re.search(r"\bloaded\(\)|\blibrary\(\)", path.read_text())]
+    assert len(files) > 5
+    assert not [
+        path for path in files for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Assert)
+    ]
+
+
+@has_library
+def test_rows_of_other_cameras_and_shapes_are_errors_before_a_call():
+    camera = ct.Pinhole([[1.0, 1, 0, 0]] * 2, image_size=(2, 2))
+    native = camera_rows(camera, *(t.detach() for t in camera._tensors)).native
+    with pytest.raises(ValueError, match="must be of 2 cameras; got those of 3"):
+        compiled.project(native, torch.ones(3, 4, 3))
+    with pytest.raises(ValueError, match=re.escape("must be of (2, 4) rows; got (2, 5)")):
+        compiled.project_vjp(native, torch.ones(2, 4, 3), torch.ones(2, 2, 5), True, False)
 
 
 @has_library
