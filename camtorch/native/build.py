@@ -126,7 +126,7 @@ def build(directory: str | os.PathLike[str] | None = None, *, sources: str | os.
             missing = [name for name, place in places.items() if not place.exists()]
             if len(missing) > 1:
                 what = f"compiling {len(missing)} units of {len(units)}, for {', '.join(known)}"
-                print(f"{what}: geometry and kernel take most of the time, some 10 s each", file=sys.stderr, flush=True)
+                print(f"{what}: geometry and kernel take some 10 s each, the others 1 s", file=sys.stderr, flush=True)
             list(pool.map(compiled, missing))
         libraries = [] if sys.platform == "win32" else ["-lm"]
         _run([*command, "-shared", "-o", LIBRARY, *map(str, places.values()), *libraries], folder)
