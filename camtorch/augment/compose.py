@@ -69,13 +69,10 @@ class Compose(Augmentation):
             options.setdefault("valid_mask", True)
         super().__init__(**options)
         self.augmentations = nn.ModuleList(parts)
-        self.needs_camera: bool = any(part.needs_camera for part in parts)
-        self.drawn_on_host: bool = all(part.drawn_on_host for part in parts)
         self._check_options(parts)
         mirrorings = {repr(m.key): m for part in parts if (m := part.mirroring) is not None}
         if len(mirrorings) > 1:
             raise ValueError(f"{name}: flips must have equal landmarks, lateral_axis and swap_sides; got others")
-        self.mirroring: Mirroring | None = next(iter(mirrorings.values()), None)
 
     def _check_options(self, parts: Sequence[Augmentation]) -> None:
         usual = {**Augmentation().options, "mask_fill": 0.0}
@@ -113,6 +110,21 @@ class Compose(Augmentation):
         """See `Augmentation`; those of all parts."""
         found = {f"{i}.{key}": index for i, part in enumerate(self.parts) for key, index in part.crops.items()}
         return MappingProxyType(found)
+
+    @property
+    def mirroring(self) -> Mirroring | None:  # type: ignore[override]
+        """That of the parts which mirror."""
+        return next((part.mirroring for part in self.parts if part.mirroring is not None), None)
+
+    @property
+    def needs_camera(self) -> bool:  # type: ignore[override]
+        """Whether a part does."""
+        return any(part.needs_camera for part in self.parts)
+
+    @property
+    def drawn_on_host(self) -> bool:  # type: ignore[override]
+        """See `Augmentation`; whether all parts are."""
+        return all(part.drawn_on_host for part in self.parts)
 
     @property
     def parts(self) -> list[Augmentation]:

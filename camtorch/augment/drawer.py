@@ -155,7 +155,7 @@ class CameraDrawer(Augmentation):
     def __setstate__(self, state: dict[str, Any]) -> None:
         if "rates" in state["ranges"]:
             raise ValueError(f"{type(self).__name__}: the saved augmentation draws a rolling shutter. {LEFT}")
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        super().__setstate__(state)
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """Return the new camera and its turn, by formulas of torch; see `Augmentation.new_camera`."""

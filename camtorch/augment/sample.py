@@ -241,6 +241,10 @@ class SampleTransform(KeepsCamera, nn.Module):
             self.__dict__["_revision"] = object()
         super().__setattr__(name, value)
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        self.__dict__["_revision"] = object()
+
     @property
     def antialias(self) -> bool | None:
         """The option of that name; None if each warp decides."""

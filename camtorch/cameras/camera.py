@@ -15,7 +15,7 @@ from typing_extensions import Self, TypeVar
 
 from camtorch.cameras.catalogue import Catalogue
 from camtorch.cameras.editing import Editable
-from camtorch.cameras.freezing import INTRINSICS, PREFIX, Freezable, learning_words, with_frozen
+from camtorch.cameras.freezing import INTRINSICS, PREFIX, Freezable, all_frozen, learning_words, with_frozen
 from camtorch.cameras.numbers import camera_of_fov, check_fast, checked_numbers, numbers_of_matrix, replaced
 from camtorch.convert.result import Conversion
 from camtorch.evaluate.kept import Kept
@@ -268,7 +268,7 @@ class Camera(Freezable, Editable):
             raise ValueError(f"{owner}: lr must be a positive number of pixels; got {lr!r}")
         for camera in (part for part in self.modules() if isinstance(part, Camera) and not part.is_mixed):
             parts: Any = camera._modules.get("parametrizations", {})
-            for name in camera.tensor_names:
+            for name in [name for name in camera.tensor_names if not all_frozen(camera, name)]:
                 held: Any = (
                     parts[name].parameters() if name in parts else [{**camera._buffers, **camera._parameters}[name]]
                 )

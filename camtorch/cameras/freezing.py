@@ -59,6 +59,12 @@ def frozen_names(camera: CameraLike) -> tuple[str, ...]:
     return tuple(found)
 
 
+def all_frozen(camera: CameraLike, tensor: str) -> bool:
+    """Whether all parameters of a tensor are frozen by name."""
+    names = dict(_tensors_of(camera)).get(tensor, ())
+    return bool(names) and {*names} <= {*frozen_names(camera)}
+
+
 def learning_words(camera: CameraLike) -> list[str]:
     """Return the end of `repr`: the dtype, "learns" if any parameter does, else "frozen", and all frozen names."""
     names = frozen_names(camera)

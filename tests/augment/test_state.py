@@ -1,6 +1,7 @@
 """The state of augmentations: results follow each public attribute, calls leave no trace, and warnings come once."""
 
 import ast
+import copy
 import inspect
 import io
 import pickle
@@ -78,8 +79,6 @@ VALUES = {
     "distance": 0.8,
     "axis": (100.0, 110.0),
     "mirroring": A.HorizontalFlip(landmarks=TABLE).mirroring,
-    "needs_camera": True,
-    "drawn_on_host": False,
     "augmentations": nn.ModuleList([A.RandomMount(roll=(5, 9)), A.RandomLens()]),
 }
 """Another valid value of each public attribute."""
@@ -101,6 +100,8 @@ CHANGES = {
     "one more range": (LIKES, lambda one: one.ranges.update(zoom=A.Range(1.2, 1.3))),
     "a range of a part": (["Compose"], lambda one: one.augmentations[1].ranges.update(yaw=A.Range(20, 30))),
     "p of a part": (["Compose"], lambda one: setattr(one.augmentations[0], "p", 0.9)),
+    "a table of a part": (["Compose"], lambda one: setattr(one.augmentations[0], "mirroring", VALUES["mirroring"])),
+    "one more part": (["Compose"], lambda one: one.augmentations.append(A.VerticalFlip(p=1))),
     "another part": (["Compose"], lambda one: one.augmentations.__setitem__(1, A.RandomLens(LIKE, fov="source"))),
 }
 """Changes of more than one attribute, or in place: for which augmentations, and how."""
@@ -255,6 +256,10 @@ OBJECTS = {
         lambda: ct.CameraHead(8, "kannala_brandt", image_size=SIZE),
         lambda one: one(torch.rand(2, 8)).project(torch.rand(2, 5, 3)),
     ),
+    "a whole turn": (
+        lambda: ct.Equirectangular.from_fov(360, image_size=SIZE),
+        lambda one: ct.Warp(one, LIKE)(torch.rand(1, 3, *SIZE)),
+    ),
     **{
         model: (
             lambda model=model: ct.MODELS[model].from_fov(80, image_size=SIZE),
@@ -365,3 +370,25 @@ def test_every_warning_of_samples_is_in_the_table():
                 calls = [one for one in ast.walk(node) if isinstance(one, ast.Call) and ast.unparse(one.func) == "warn"]
                 found |= {node.name} if calls else set()
     assert found == {where for where, _, _ in WARNINGS.values()}
+
+
+def test_parts_of_a_chain_that_are_added_later_count():
+    chain = A.Compose([A.HorizontalFlip(p=1)])
+    fields = {"image": torch.zeros(3, *SIZE), "keypoints": torch.tensor([[10.0, 20], [50, 20]])}
+    chain(fields)
+    chain.augmentations[0] = A.HorizontalFlip(p=1, landmarks=[(0, 1)])
+    assert chain(fields)["keypoints"].tolist() == [[13.0, 20], [53, 20]]
+    chain.augmentations.append(A.RandomMount())
+    with pytest.raises(ValueError, match="must have a camera"):
+        chain(fields)
+
+
+def test_replays_of_kornia_follow_the_order_of_parts():
+    flips = A.HorizontalFlip(p=0.5), A.VerticalFlip(p=0.5)
+    adapter = copy.deepcopy(camtorch.augment.kornia.CameraAugmentation(A.Compose(flips), camera(), p=1))
+    images = torch.rand(6, 3, *SIZE)
+    adapter(images)
+    params, parts = adapter._params, adapter.augmentation.augmentations
+    parts[0], parts[1] = parts[1], parts[0]
+    new = camtorch.augment.kornia.CameraAugmentation(A.Compose(flips[::-1]), camera(), p=1)
+    assert torch.equal(adapter(images, params=params), new(images, params=params))
