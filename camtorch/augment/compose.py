@@ -116,6 +116,12 @@ class Compose(Augmentation):
         """That of the parts which mirror."""
         return next((part.mirroring for part in self.parts if part.mirroring is not None), None)
 
+    @mirroring.setter
+    def mirroring(self, value: Mirroring | None) -> None:
+        for part in self.parts:
+            if part.mirroring is not None:
+                part.mirroring = value
+
     @property
     def needs_camera(self) -> bool:  # type: ignore[override]
         """Whether a part does."""
