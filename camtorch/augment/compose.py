@@ -112,7 +112,7 @@ class Compose(Augmentation):
         return MappingProxyType(found)
 
     @property
-    def mirroring(self) -> Mirroring | None:  # type: ignore[override]
+    def mirroring(self) -> Mirroring | None:
         """That of the parts which mirror."""
         return next((part.mirroring for part in self.parts if part.mirroring is not None), None)
 
