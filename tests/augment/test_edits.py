@@ -239,7 +239,9 @@ def test_chains_take_all_unsigned_integers(name, dtype):
     for seed in range(5):
         for count in (3, 1):
             draw = augment.draw(count, torch.Generator().manual_seed(seed))
-            expected = augment(image=images[:count].double(), draw=draw)["image"].clamp(min=0)
+            # ids of signed integers: at exact halves of pixels the nearest one of floats may be the other one
+            wide = images[:count].double() if dtype == "uint16" else images[:count]
+            expected = augment(image=wide, draw=draw)["image"].clamp(min=0)
             moved = augment(image=images[:count].to(getattr(torch, dtype)), draw=draw)["image"]
             assert moved.dtype == getattr(torch, dtype)
             assert (moved.double() - expected).abs().max() <= 1  # two roundings
