@@ -163,8 +163,7 @@ class GeometryModule(UnsharedState):
     def __getstate__(self) -> dict[str, Any]:
         # a tensor of a graph cannot be copied with its graph: the copy is a leaf
         state = self.__dict__.copy()
-        for name in ("_told", "_seam"):  # what calls leave
-            state.pop(name, None)
+        state.pop("_told", None)  # what a call leaves
         state["_buffers"] = {
             name: b if b is None or b.is_leaf else b.detach().requires_grad_() for name, b in self._buffers.items()
         }

@@ -256,10 +256,6 @@ OBJECTS = {
         lambda: ct.CameraHead(8, "kannala_brandt", image_size=SIZE),
         lambda one: one(torch.rand(2, 8)).project(torch.rand(2, 5, 3)),
     ),
-    "a whole turn": (
-        lambda: ct.Equirectangular.from_fov(360, image_size=SIZE),
-        lambda one: ct.Warp(one, LIKE)(torch.rand(1, 3, *SIZE)),
-    ),
     **{
         model: (
             lambda model=model: ct.MODELS[model].from_fov(80, image_size=SIZE),
