@@ -1,8 +1,11 @@
 import gc
+import os
 import sys
 import warnings
 
 import pytest
+
+os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")  # its import asks a server, and warns if none answers
 
 
 @pytest.hookimpl(wrapper=True)
