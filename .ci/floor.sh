@@ -17,10 +17,15 @@ if [ ! -e "$environment/bin/pip" ]; then
     "$python" -m venv "$environment"
 fi
 . "$environment/bin/activate"
-declared=$(sed -n '/^requires-python/s/.*>=\(.*\)"/\1/p' pyproject.toml)
-python -c "import sys; now = '.'.join(map(str, sys.version_info[:2])); now == '$declared' or print('this is Python', now, 'rather than $declared')"
 # "name>=1.2" in dependencies becomes name==1.2.*: the last repair of that version
-sed -n 's/^dependencies = \[\(.*\)\]$/\1/p' pyproject.toml | tr -d '" ' | tr ',' '\n' | sed 's/>=\(.*\)/==\1.*/' > "$environment/floor.txt"
+python - > "$environment/floor.txt" <<'END'
+import sys, tomllib
+project = tomllib.load(open("pyproject.toml", "rb"))["project"]
+now = ".".join(map(str, sys.version_info[:2]))
+if now != project["requires-python"].removeprefix(">="):
+    print("this is Python", now, "rather than", project["requires-python"], file=sys.stderr)
+print(*(f"{library.replace('>=', '==')}.*" for library in project["dependencies"]), sep="\n")
+END
 cat "$environment/floor.txt"
 pip install --quiet -r "$environment/floor.txt" pytest hypothesis
 pip install --quiet --no-deps -e .

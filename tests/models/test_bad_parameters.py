@@ -165,6 +165,7 @@ def test_a_step_to_a_negative_focal_length_is_said_once(key):
     assert not camera.unproject(POINTS[:, :2])[1].any()
 
 
+@pytest.mark.skipif(torch.__version__.startswith("2.10."), reason="torch 2.10 compiles no Warp in one graph")
 @pytest.mark.filterwarnings("ignore:.*became unusable")
 def test_a_compiled_warp_of_a_bad_camera_shows_nothing():
     source = ct.KannalaBrandt([15.0, 15.0, 12.0, 9.0], [0.0, 0.0, 0.0, 0.0], image_size=(80, 96)).requires_grad_(False)

