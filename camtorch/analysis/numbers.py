@@ -67,7 +67,7 @@ def difference(a: Camera, b: Camera, *, remove_rotation: bool = False) -> Differ
     for camera in (a, b):
         if camera.batch_shape:
             raise ValueError(f"difference: cameras must be single; got batch dims {tuple(camera.batch_shape)}")
-    height, width = a._size_for("a difference")
+    height, width = a.size_for("a difference")
     if b.image_size not in (None, a.image_size):
         raise ValueError(f"difference: images must be of one size; got {a.image_size} and {b.image_size}")
     scale = _LONG / max(height, width)

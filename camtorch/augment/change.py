@@ -106,7 +106,7 @@ class Part:
     @property
     def image_size(self) -> tuple[int, int]:
         """(height, width) after the change."""
-        return self.moves.image_size if isinstance(self.moves, Drawn) else self.target._size_for("Warp")
+        return self.moves.image_size if isinstance(self.moves, Drawn) else self.target.size_for("Warp")
 
     def between(self) -> tuple[Native, Native, Tensor | None] | None:
         """Return both cameras and the rotation for compiled code; None if it takes more than that."""
@@ -174,9 +174,9 @@ def _joined(a: Part, b: Part) -> Part:
 
 def _single(camera: Camera) -> Native | None:
     """Return a single camera for compiled code; None if it cannot evaluate it."""
-    if seam_of(camera) is not None or not are_numbers(*camera._tensors):
+    if seam_of(camera) is not None or not are_numbers(*camera.tensors):
         return None
-    rows = rows_of(camera, *camera._tensors)
+    rows = rows_of(camera, *camera.tensors)
     return rows.native if rows.usable is None else None
 
 
@@ -254,7 +254,7 @@ class Change:
         rows = [part.rows for part in self.parts if part.rows is not None]
         if not rows:
             return batches[0]
-        check_sizes(camera._size_for("Change") for camera in cameras)
+        check_sizes(camera.size_for("Change") for camera in cameras)
         together = Mixed.of_groups(list(zip(rows, batches, strict=True)))
         groups = together.groups
         return together if self.mixed or len(groups) > 1 else groups[0][1]

@@ -220,7 +220,7 @@ class CameraDrawer(Augmentation):
     def _tensors_of(self, source: Camera) -> tuple[Tensor, ...]:
         """Return the tensors that new cameras depend on."""
         like = self._like_for(source)
-        return source._tensors if like is None else (*source._tensors, *like._tensors)
+        return source.tensors if like is None else (*source.tensors, *like.tensors)
 
     def _key(self, source: Camera, names: Iterable[str], share: float | None) -> tuple[Any, ...]:
         """Return all else that what new cameras are drawn from depends on."""
@@ -277,7 +277,7 @@ class CameraDrawer(Augmentation):
         gate, shares, spans = draw_shares(self.ranges, 1, self.p, generator, self._spans)
         self.__dict__["_spans"] = spans
         applied, numbers = self.p >= 1 if gate is None else bool(gate), spans.numbers(shares.tolist())
-        tensors = camera._tensors if like is None else (*camera._tensors, *like._tensors)
+        tensors = camera.tensors if like is None else (*camera.tensors, *like.tensors)
         fields = [sample[name] for name in ready.names]
         known = self._memo.entry(tensors, ready.key) if applied and are_free(*tensors, *fields) else None
         for name, found in ready.checked:
@@ -366,7 +366,7 @@ class CameraDrawer(Augmentation):
         )
 
     def _size_of(self, source: Camera) -> tuple[int, int]:
-        return self.image_size or source.image_size or source._size_for(self._name)
+        return self.image_size or source.image_size or source.size_for(self._name)
 
     def _base(self, source: Camera, share: Any) -> tuple[Camera, Tensor, Tensor | None]:
         """Return whose lens the new cameras have, its intrinsics (*B, 4) before their images, and how far it reaches.
@@ -379,7 +379,7 @@ class CameraDrawer(Augmentation):
         if self._is_real:
             intrinsics, k, reach = drawn(torch.as_tensor(share, dtype=dtype, device=device), size, self._among)
             base = remade(_ANY, intrinsics=intrinsics, distortion=k, image_size=size)
-        if any(t.dtype != dtype or t.device != device for t in base._tensors):
+        if any(t.dtype != dtype or t.device != device for t in base.tensors):
             base = base.each(lambda t: t.to(device, dtype))
         sized = _sized(base, size) if self.fov is None else precise(self._from_source(source, base, size))
         return base, sized, reach
@@ -393,7 +393,7 @@ class CameraDrawer(Augmentation):
             middle = precise(base.intrinsics).new_tensor(self.ranges["fov"].middle)
             return _as_wide(base, sized, middle, size[1]).detach().to(base.intrinsics.dtype)
 
-        return self._memo(base._tensors, ("nominal", type(base), base.image_size, size, self.ranges["fov"]), made)
+        return self._memo(base.tensors, ("nominal", type(base), base.image_size, size, self.ranges["fov"]), made)
 
     def _from_source(self, source: Camera, base: Camera, size: tuple[int, int]) -> Tensor:
         """Return intrinsics (*B, 4) of the lens, at most as wide as its like, whose images the source fills."""
@@ -406,7 +406,7 @@ class CameraDrawer(Augmentation):
             return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
 
         key = "source", type(source), source.image_size, type(base), base.image_size, size
-        return self._memo(source._tensors + base._tensors, key, narrowed)
+        return self._memo(source.tensors + base.tensors, key, narrowed)
 
 
 class Ready(NamedTuple):

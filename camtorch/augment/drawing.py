@@ -43,12 +43,12 @@ class Start:
         source: the camera before. base: whose lens the new ones have, single or (B,). numbers: see `__init__`.
         """
         before, cameras = (
-            rows_of(camera, *[t.expand(*camera.batch_shape, t.shape[-1]) for t in camera._tensors])
+            rows_of(camera, *[t.expand(*camera.batch_shape, t.shape[-1]) for t in camera.tensors])
             for camera in (source, base)
         )
         if before.native is None or cameras.native is None or before.usable is not None or cameras.usable is not None:
             return None
-        if {t.dtype for t in source._tensors} != {base.intrinsics.dtype}:
+        if {t.dtype for t in source.tensors} != {base.intrinsics.dtype}:
             return None
         return cls(source, before.native, base, cameras.native, *numbers)
 
@@ -89,7 +89,7 @@ class Start:
         call.reach = None if reach is None else self._keep(reach.double())
         if share:
             call.share, call.source = with_care(share), before.pointer
-            call.source_height, call.source_width = source._size_for("min_filled")
+            call.source_height, call.source_width = source.size_for("min_filled")
             call.looked_at = self._keep(looked_at(size, native.dtype))
             before.add_table()
         if nominal is not None:

@@ -28,7 +28,7 @@ def twin_of(camera: Camera) -> Camera | None:
     members = cast("list[Camera]", list(camera.cameras)) if isinstance(camera, Mixed) else [camera]
     if members[0].intrinsics.is_cpu or is_unknown(members[0].intrinsics) or not native_available():
         return None
-    tensors = [t for one in members for t in one._tensors]
+    tensors = [t for one in members for t in one.tensors]
     if not may_read(*tensors):
         return None
 
@@ -37,7 +37,7 @@ def twin_of(camera: Camera) -> Camera | None:
         twins = [remade(one, intrinsics=next(values), distortion=next(values)) for one in members]
         return camera.of_members(twins) if isinstance(camera, Mixed) else twins[0]
 
-    return _twins(tensors, (camera._form,), made)
+    return _twins(tensors, (camera.form,), made)
 
 
 def remember_camera(camera: Camera, twin: Camera) -> None:
@@ -46,7 +46,7 @@ def remember_camera(camera: Camera, twin: Camera) -> None:
         for (_, group), (_, its) in zip(camera.groups, twin.groups, strict=True):
             remember_camera(group, its)
         return
-    for there, here in zip(camera._tensors, twin._tensors, strict=True):
+    for there, here in zip(camera.tensors, twin.tensors, strict=True):
         for shape in {there.shape, (*camera.batch_shape, there.shape[-1])}:  # as it is, and as it is asked for
             remember(there.expand(shape), here.expand(shape))
 
@@ -88,7 +88,7 @@ def _remade(parts: Sequence[Part], change: Callable[[list[Tensor]], list[Tensor]
     """Return parts with all their numbers changed, at once; those that go elsewhere are found where they were."""
     given: list[Tensor] = []
     for part in parts:
-        given += [t for camera in _cameras(part) for t in camera._tensors]
+        given += [t for camera in _cameras(part) for t in camera.tensors]
         given += [t for t in (part.rotation, part.light) if t is not None]
     numbers = iter(change(given))
 

@@ -89,7 +89,7 @@ def sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
     odd = camera.odd_in_x | camera.odd_in_y
     lopsided = np.array([name in odd for name in camera.distortion_names], bool)
     share = np.where(lopsided, np.float32(_SMALL), np.float32(1)) / np.float32(max((~lopsided).sum(), 1))
-    corner = math.hypot(*camera._size_for("the effect of its coefficients")) / 2
+    corner = math.hypot(*camera.size_for("the effect of its coefficients")) / 2
     return torch.from_numpy(share * np.where(most > 0, corner / most.clip(min=1e-30), 0.0)).to(distortion.device)
 
 
@@ -98,12 +98,12 @@ def _rim(camera: Camera) -> Tensor:
 
     A lens that is invertible on the image's edges, and where it ends on the image, is invertible inside.
     """
-    edges = border(camera._size_for("its rim"), camera.intrinsics.dtype).to(camera.intrinsics.device)
+    edges = border(camera.size_for("its rim"), camera.intrinsics.dtype).to(camera.intrinsics.device)
     rim = edges.expand(*camera.batch_shape, *edges.shape)
     if len(camera.distortion) == 1:  # less work on other devices than a check of all rays
         ends = measured_once(lens_ends, camera, camera.distortion)
         least = (ends * ends).sum(-1).amin(-1).sqrt()
-        if bool((covering(camera.intrinsics, least, camera._size_for("its rim")) == 1).all()):
+        if bool((covering(camera.intrinsics, least, camera.size_for("its rim")) == 1).all()):
             return rim
     if not bool(camera.unproject(rim)[1].all()):
         focal, centre = camera.intrinsics[:, None, :2], camera.intrinsics[:, None, 2:]

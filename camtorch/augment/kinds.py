@@ -449,7 +449,7 @@ def together(change: Change, named: Named, form: Form, mask_fill: float) -> dict
     source, target, rotation = between
     moved = part.moves if isinstance(part.moves, Drawn) and change.count == 1 else None
     is_turn, options = moved is not None and moved.is_turn, part.moves.options
-    sizes = part.camera._size_for("Warp"), part.image_size
+    sizes = part.camera.size_for("Warp"), part.image_size
     settings = sizes, source.dtype, options, mask_fill, moved is None, is_turn, thread_count()
     if settings != form.settings:
         hows = _ways(named, options, mask_fill, source.dtype if moved is not None else None, is_turn, change.count == 1)

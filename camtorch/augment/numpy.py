@@ -111,7 +111,7 @@ class Transform(FrontEnd):
             form = form, size, {**own.fields}, own.mirroring
             layouts = self._forms((), form, lambda: self._layouts(sample, size))
             if layouts is not None:
-                learns = not isinstance(camera, Camera) or any(t.requires_grad for t in camera._tensors)
+                learns = not isinstance(camera, Camera) or any(t.requires_grad for t in camera.tensors)
                 return _moved_arrays(move, sample, options, layouts, learns)
         entries = {name: self._entry(name, value, sample, size) for name, value in sample.items()}
         inside = {key: tensor for tensors, _ in entries.values() for key, tensor in tensors.items()}

@@ -139,7 +139,7 @@ def detached(value: Any) -> Any:
     """Return a value, also a dict or a list of them, in which no tensor and no camera has a graph."""
 
     def of(one: Any) -> Any:
-        learns = isinstance(one, (Tensor, Camera)) and any(t.requires_grad for t in getattr(one, "_tensors", (one,)))
+        learns = isinstance(one, (Tensor, Camera)) and any(t.requires_grad for t in getattr(one, "tensors", (one,)))
         return one.detach() if learns else one
 
     return pytree.tree_map(of, value)
@@ -348,7 +348,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         """Return all that is checked of a sample but values; None if a field is no tensor or number, or of a Mixed."""
         if not isinstance(camera, Camera) or camera.is_mixed or not are_free():
             return None
-        intrinsics, distortion = camera._tensors
+        intrinsics, distortion = camera.tensors
         # each thread has calls of its own
         parts: list[Any] = [get_ident(), type(sample), type(camera), camera.image_size]
         parts += intrinsics.shape, intrinsics.dtype, intrinsics.device, distortion.shape

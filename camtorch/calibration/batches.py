@@ -32,7 +32,7 @@ def as_vectors(values: Numbers, name: str, size: int, owner: str, device: torch.
 
 def rows_of(camera: Camera, batch: torch.Size) -> Camera:
     """Return the camera in float64 with its graph: `math.prod(batch)` rows, or no batch if it is one for all rows."""
-    if not camera.batch_shape and all(t.dtype == torch.float64 for t in camera._tensors):
+    if not camera.batch_shape and all(t.dtype == torch.float64 for t in camera.tensors):
         return camera
     tensors = {}
     shared = math.prod(camera.batch_shape) == 1

@@ -229,7 +229,7 @@ class Search:
                 first = start_from_nothing(seen, asked.kind, asked.count, size, fixed, self.loss, self.loss_scale)
             first = first.of(torch.arange(1, device=seen.pixels.device))
         else:
-            given = torch.cat([t.detach().to(seen.pixels).reshape(1, -1) for t in asked.start._tensors], -1)
+            given = torch.cat([t.detach().to(seen.pixels).reshape(1, -1) for t in asked.start.tensors], -1)
             first = poses_for(Lens(asked.kind, given, Poses.none(1, 1, given), size), seen)
         adjusted = optimum(first)
         for _ in range(3):

@@ -75,7 +75,7 @@ def fit(
     values = [torch.nan, torch.nan, (width - 1) / 2, (height - 1) / 2, *asked.kind.ideal(asked.count)]
     kept = torch.tensor(values, dtype=torch.float64, device="cpu")
     if start is not None:
-        kept = torch.cat([t.detach().double().reshape(-1).cpu() for t in start._tensors])
+        kept = torch.cat([t.detach().double().reshape(-1).cpu() for t in start.tensors])
     elif size is None and not bool(asked.free[2:4].all()):
         raise ValueError(f"{owner}: image_size must be given if cx or cy is fixed; got None. Pass (height, width)")
     kept = torch.where(asked.free, torch.nan, kept)

@@ -182,7 +182,7 @@ class _Given(NamedTuple):
         except ValueError:
             got = f"{shapes}, weights of {leads[2]} and a camera of {tuple(camera.batch_shape)}"
             raise ValueError(f"{owner}: batch dims must broadcast; got {got}") from None
-        dtype = working_dtype(points, seen_at, *camera._tensors)
+        dtype = working_dtype(points, seen_at, *camera.tensors)
 
         def rows(values: Tensor, *size: int) -> Tensor:
             return values.double().expand(*batch, *size).reshape(-1, *size)
@@ -309,7 +309,7 @@ class _Found(NamedTuple):
 def _minimum(task: _Task, rotations: Tensor, translations: Tensor, valid: Tensor) -> _Found:
     """Return the minima near poses (B, ...); valid, bool (B,), selects the rows that count."""
     camera = task.camera
-    parameters = torch.cat(camera._tensors, -1).detach()
+    parameters = torch.cat(camera.tensors, -1).detach()
     parameters = parameters.view(-1, parameters.shape[-1])
     observed = CameraObservations(model_of(camera), task.points[:, None], task.pixels[:, None], task.weights[:, None])
     found = adjust_poses(observed, parameters, Poses(rotations[:, None], translations[:, None]), steps=_SEARCH.steps)

@@ -85,7 +85,7 @@ def triangulate(
             f"{len(given)} cameras, {len(poses)} extrinsics and pixels {tuple(seen_at.shape)}"
         )
     check_devices("triangulate", pixels=seen_at, **{f"extrinsics[{i}]": p.rotation for i, p in enumerate(poses)})
-    dtype = working_dtype(seen_at, *(t for camera in given for t in camera._tensors), *(p.rotation for p in poses))
+    dtype = working_dtype(seen_at, *(t for camera in given for t in camera.tensors), *(p.rotation for p in poses))
     rows = [rows_of(camera, torch.Size()) for camera in given]
     matrices = torch.stack([pose.matrix().double() for pose in poses])
     at = seen_at.double().reshape(count, torch.Size(shape).numel(), 2)
@@ -160,7 +160,7 @@ def _solve(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
     # a point is the position of a board with one corner, in the frame of the first camera
     first, shift = rotations[0], translations[0]
     turns = rotations @ first.mT
-    parameters = tuple(torch.cat(camera._tensors, -1).detach()[None] for camera in task.cameras)
+    parameters = tuple(torch.cat(camera.tensors, -1).detach()[None] for camera in task.cameras)
     state = State(
         parameters,
         Poses(turns[None], (translations - turns @ shift)[None]).expand(count),

@@ -314,12 +314,12 @@ class Camera(Freezable, Editable):
     @property
     def height(self) -> int:
         """The image's height in pixels; a ValueError if the camera has no image size."""
-        return self._size_for("height")[0]
+        return self.size_for("height")[0]
 
     @property
     def width(self) -> int:
         """The image's width in pixels; see `height`."""
-        return self._size_for("width")[1]
+        return self.size_for("width")[1]
 
     def _model_name(self) -> str:
         # a class that only adds methods has the model of its base
@@ -394,14 +394,9 @@ class Camera(Freezable, Editable):
 
     _evaluate = evaluate_rows
 
-    @property
-    def _tensors(self) -> tuple[Tensor, ...]:
-        """All tensors that the camera learns, or could."""
-        return self.intrinsics, self.distortion
-
     def contains(self, pixels: Numbers) -> Tensor:
         """Whether pixels (..., 2) lie on the image, its outer pixel edges included; bool (...)."""
-        return on_image(pixels, self._size_for("contains"), type(self).__name__)
+        return on_image(pixels, self.size_for("contains"), type(self).__name__)
 
     def pixel_grid(self, stride: int = 1) -> Tensor:
         """Return (H, W, 2), the centre of every pixel, or (H / stride, W / stride, 2), that of every patch.
@@ -414,14 +409,14 @@ class Camera(Freezable, Editable):
             ValueError: If there is no image size, or it is no multiple of the stride: edit the camera like the image.
         """
         like = self.intrinsics.new_empty(0, dtype=torch.promote_types(self.intrinsics.dtype, torch.float32))
-        return patch_centres(self._size_for("pixel_grid"), stride, like, type(self).__name__)
+        return patch_centres(self.size_for("pixel_grid"), stride, like, type(self).__name__)
 
     def rays(self, stride: int = 1) -> tuple[Tensor, Tensor]:
         """Return the rays (*B, H, W, 3) of all pixels, and valid (*B, H, W); or of all patches, see `pixel_grid`.
 
         Up to half a million rays are kept while nothing that they depend on can learn or changes.
         """
-        rays, valid = over_image(self, self._rays, self._tensors, stride, self.unproject)
+        rays, valid = over_image(self, self._rays, self.tensors, stride, self.unproject)
         return rays, valid
 
     def plucker(self, extrinsics: Extrinsics | None = None, stride: int = 1) -> tuple[Tensor, Tensor]:
@@ -580,7 +575,7 @@ class Camera(Freezable, Editable):
 
     def extra_repr(self) -> str:
         parts = [f"batch_shape={tuple(self.batch_shape)}"] if self.batch_shape else []
-        numbers = None if self.batch_shape else values_of(torch.cat(self._tensors, -1))
+        numbers = None if self.batch_shape else values_of(torch.cat(self.tensors, -1))
         if numbers is not None:
             names = *INTRINSICS, *self.distortion_names
             parts += [f"{name}={value:.6g}" for name, value in zip(names, numbers.tolist(), strict=True)]

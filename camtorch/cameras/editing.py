@@ -123,7 +123,7 @@ class Editable(CameraLike):
 
     def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
         """Return the camera of the image with that many more pixels on each side."""
-        height, width = self._size_for("pad")
+        height, width = self.size_for("pad")
         sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
         left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
         return edited_by(self, ((1, 0, left), (0, 1, top)), (height + top + bottom, width + left + right))
@@ -134,7 +134,7 @@ class Editable(CameraLike):
 
         It warns if the new size is like the old one with height and width exchanged.
         """
-        old_height, old_width = self._size_for("resize")
+        old_height, old_width = self.size_for("resize")
         as_image_size((height, width), f"{type(self).__name__}.resize")
         warn_of_exchange((old_height, old_width), (height, width), f"{type(self).__name__}.resize")
         across, down = width / old_width, height / old_height
@@ -142,12 +142,12 @@ class Editable(CameraLike):
 
     def hflip(self) -> Self:
         """Return the camera that sees the scene mirrored left to right: its image is this one's, flipped."""
-        height, width = self._size_for("hflip")
+        height, width = self.size_for("hflip")
         return edited_by(self, ((-1, 0, width - 1), (0, 1, 0)), (height, width))
 
     def vflip(self) -> Self:
         """Return the camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
-        height, width = self._size_for("vflip")
+        height, width = self.size_for("vflip")
         return edited_by(self, ((1, 0, 0), (0, -1, height - 1)), (height, width))
 
     def rot90(self, k: int = 1) -> Self:
@@ -158,5 +158,5 @@ class Editable(CameraLike):
         Raises:
             ValueError: If a model that is not the same on its side, like a cylinder's, is turned by a quarter.
         """
-        size, turns = self._size_for("rot90"), as_whole(k, "k", "rot90") % 4
+        size, turns = self.size_for("rot90"), as_whole(k, "k", "rot90") % 4
         return edited_by(self, quarter_turns(size)[turns], size[::-1] if turns % 2 else size)

@@ -108,7 +108,7 @@ class Mixed(Camera):
     def groups(self) -> list[tuple[list[int], Camera]]:
         """The rows of each model and number of coefficients, and their cameras as a batch; gradients go to all."""
         made = []
-        for group, (intrinsics, distortion) in zip(self._groups, self._pairs(self._tensors), strict=True):
+        for group, (intrinsics, distortion) in zip(self._groups, self._pairs(self.tensors), strict=True):
             first = self._member(group.members[0])
             if group.counts[1:] or group.counts[0] is None or group.taken is not None:
                 first = remade(first, intrinsics=intrinsics, distortion=distortion)
@@ -124,12 +124,12 @@ class Mixed(Camera):
         return torch.Size((len(self._places),))
 
     @property
-    def _tensors(self) -> tuple[Tensor, ...]:
+    def tensors(self) -> tuple[Tensor, ...]:
         """Intrinsics and distortion of each group."""
         tensors: list[Tensor] = []
         members = cast("list[Camera]", list(self.cameras._modules.values()))
         for group in self._groups:
-            pairs = [members[i]._tensors for i in group.members]
+            pairs = [members[i].tensors for i in group.members]
             tensors += [_stack_group(numbers, group) for numbers in zip(*pairs, strict=True)]
         if all(t.dtype == tensors[0].dtype for t in tensors):
             return tuple(tensors)
@@ -141,13 +141,13 @@ class Mixed(Camera):
         return zip(tensors[::2], tensors[1::2], strict=True)
 
     @property
-    def _form(self) -> tuple[object, ...]:
+    def form(self) -> tuple[object, ...]:
         return type(self), self.image_size, tuple((group.model, group.rows) for group in self._groups)
 
     @property
     def intrinsics(self) -> Tensor:  # type: ignore[override]
         """(B, 4) fx, fy, cx, cy of all."""
-        parts = [t.expand(len(group.rows), 4) for group, t in zip(self._groups, self._tensors[::2], strict=True)]
+        parts = [t.expand(len(group.rows), 4) for group, t in zip(self._groups, self.tensors[::2], strict=True)]
         return parts[0] if len(parts) == 1 else self._in_order(torch.cat(parts))
 
     @property
@@ -203,7 +203,7 @@ class Mixed(Camera):
                 for member in map(self._member, group.members):
                     if not (member._warned or member._told):
                         lead = member.batch_shape
-                        camera_rows(member, *(per_row(t.to(intrinsics), lead, t) for t in member._tensors))
+                        camera_rows(member, *(per_row(t.to(intrinsics), lead, t) for t in member.tensors))
             return found
 
         return cameras

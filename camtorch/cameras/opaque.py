@@ -65,7 +65,7 @@ def opaque(shapes: Function) -> Callable[[Function], Function]:
                 if isinstance(argument, Camera):
                     kinds.append(f"camera {argument._model}")
                     tensors += [argument.intrinsics.detach(), argument.distortion.detach()]
-                    sizes += argument._size_for(name)
+                    sizes += argument.size_for(name)
                 elif isinstance(argument, Tensor):
                     kinds.append("tensor")
                     tensors.append(argument)

@@ -61,7 +61,7 @@ def convert(
 
     limit = math.pi if max_angle is None else min(math.pi, max_angle)
     batch = source.batch_shape
-    tensors = [t.detach().double().expand(*batch, -1).reshape(batch.numel(), t.shape[-1]) for t in source._tensors]
+    tensors = [t.detach().double().expand(*batch, -1).reshape(batch.numel(), t.shape[-1]) for t in source.tensors]
     parts = []
     for intrinsics, distortion in zip(*(t.split(_ROWS) for t in tensors), strict=True):
         rays = reference(remade(source, intrinsics=intrinsics, distortion=distortion), image_size, limit)
@@ -85,7 +85,7 @@ class _Task(NamedTuple):
     tolerance: float
 
     def of(self, rows: Tensor) -> _Task:
-        intrinsics, distortion = (t[rows] for t in self.source.camera._tensors)
+        intrinsics, distortion = (t[rows] for t in self.source.camera.tensors)
         camera = remade(self.source.camera, intrinsics=intrinsics, distortion=distortion)
         return self._replace(source=self.source.of(camera, rows))
 

@@ -38,8 +38,8 @@ class Exact:
         if (count := warp.batch_shape.numel()) != 1:
             raise ValueError(f"{owner}: warp must be a single one, as of camera[i]; got a batch of {count}")
         self.warp = warp
-        self.source_size: tuple[int, int] = warp.source._size_for(owner)
-        self.target_size: tuple[int, int] = warp.target._size_for(owner)
+        self.source_size: tuple[int, int] = warp.source.size_for(owner)
+        self.target_size: tuple[int, int] = warp.target.size_for(owner)
         with torch.no_grad():
             self._back = warp.inverse()
         height, width = self.target_size

@@ -140,7 +140,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
         ValueError: If a camera is a batch, or image sizes are missing or differ.
     """
     compared = numbers.difference(a, b, remove_rotation=remove_rotation)
-    height, width = a._size_for("a difference")
+    height, width = a.size_for("a difference")
     ax = axes_or_new(ax)
     values = np.ma.masked_array(compared.apart.numpy(force=True), ~compared.both.numpy(force=True))
     ax.set_facecolor(NO_RAYS)
@@ -324,7 +324,7 @@ def check_single(camera: Camera) -> None:
 def size_of(camera: Camera) -> tuple[int, int]:
     """Return (height, width) of a single camera, which must have them."""
     check_single(camera)
-    return camera._size_for("a plot")
+    return camera.size_for("a plot")
 
 
 def draw_frame(ax: Axes, height: int, width: int) -> tuple[float, float, float, float]:

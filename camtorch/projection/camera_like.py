@@ -29,9 +29,6 @@ class CameraLike(ModelSpec, BatchedModule):
         distortion: Tensor
 
         @property
-        def _tensors(self) -> tuple[Tensor, ...]: ...
-
-        @property
         def fov(self) -> Tensor: ...
 
         def project(self, points: Numbers) -> tuple[Tensor, Tensor]: ...
@@ -46,12 +43,19 @@ class CameraLike(ModelSpec, BatchedModule):
             self, direction: Any, rows: Tensor, lead: Any, tensors: Any, cameras_of: Any = None
         ) -> tuple[Tensor, Tensor]: ...
 
+    # what rooms ask of cameras, and users do not: neither `dir` nor the API pages list it
+
     @property
-    def _form(self) -> tuple[object, ...]:
+    def tensors(self) -> tuple[Tensor, ...]:
+        """All tensors that the camera learns, or could."""
+        return self.intrinsics, self.distortion
+
+    @property
+    def form(self) -> tuple[object, ...]:
         """Everything but the tensors: cameras of one form and equal tensors are the same."""
         return type(self), self.image_size
 
-    def _size_for(self, what: str) -> tuple[int, int]:
+    def size_for(self, what: str) -> tuple[int, int]:
         if self.image_size is None:
             raise ValueError(f"{type(self).__name__}: image_size must be (height, width) for {what}; got None")
         return self.image_size

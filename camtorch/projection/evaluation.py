@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def evaluate_points(camera: CameraLike, direction: Direction, values: Numbers) -> tuple[Tensor, Tensor]:
     """Return the planes and the mask of `evaluate_rows` for values (*B, *N, size), in their shape."""
-    lead, tensors, size = camera.batch_shape, camera._tensors, direction.size
+    lead, tensors, size = camera.batch_shape, camera.tensors, direction.size
     batch, dims = lead, len(lead)
     if (
         not isinstance(values, Tensor)
@@ -66,7 +66,7 @@ def evaluate_rows(
     way = way_of(camera, *inputs)
     if way.is_constant and cameras_of is None and all(isinstance(side, int) for side in lead):
         with with_values(camera):
-            intrinsics, distortion = (per_row(t, lead, rows) for t in camera._tensors)
+            intrinsics, distortion = (per_row(t, lead, rows) for t in camera.tensors)
             cameras = rows_of(camera, intrinsics, distortion).with_all_tables()
         with portable_export(rows) as order:
             return direction.formula(type(camera), rows, intrinsics, distortion, cameras, order)
@@ -92,7 +92,7 @@ def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Na
     for camera in cameras:
         if not isinstance(camera, nn.Module) or camera.is_mixed:
             return None
-        pairs.append(camera._tensors)
+        pairs.append(camera.tensors)
         inputs += pairs[-1]
     if not (dtype.is_floating_point and are_free(*inputs)):
         return None

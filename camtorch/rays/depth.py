@@ -40,7 +40,7 @@ def depth_scale(depth: Tensor, rays: Tensor, valid: Tensor, kind: str) -> tuple[
 def backproject(camera: CameraLike, depth: Numbers, kind: str) -> tuple[Tensor, Tensor]:
     """Return points (*B, H, W, 3) and valid (*B, H, W); see `Camera.backproject`."""
     owner, batch = f"{type(camera).__name__}.backproject", camera.batch_shape
-    depth = as_depth(depth, kind, camera._size_for("backproject"), owner, camera.intrinsics.device)
+    depth = as_depth(depth, kind, camera.size_for("backproject"), owner, camera.intrinsics.device)
     fits = not batch or (depth.ndim == 4 and len(batch) == 1 and len(depth) in (1, *batch))
     if not fits or (depth.ndim == 4 and depth.shape[1] != 1):
         of = f" for cameras {tuple(batch)}" if batch else ""

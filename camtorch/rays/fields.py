@@ -66,9 +66,9 @@ def over_image(
     if is_unknown(camera.intrinsics):  # nothing is kept, and a comparison would bound symbolic sizes
         return compute()
     step = max(as_whole(stride, "stride", "pixel_grid"), 1)
-    if math.prod((*camera.batch_shape, *camera._size_for("pixel_grid"))) // step**2 > _MOST_KEPT:
+    if math.prod((*camera.batch_shape, *camera.size_for("pixel_grid"))) // step**2 > _MOST_KEPT:
         return compute()
-    return memo.copies(inputs, (camera._form, stride), compute)
+    return memo.copies(inputs, (camera.form, stride), compute)
 
 
 def plucker(rays: Tensor, valid: Tensor, extrinsics: Extrinsics | None, owner: str) -> tuple[Tensor, Tensor]:
@@ -110,7 +110,7 @@ def tangents(camera: CameraLike, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor
         by_u: Any = torch.func.jvp(camera.unproject, (pixels,), (right,), has_aux=True)
         by_v: Any = torch.func.jvp(camera.unproject, (pixels,), (below,), has_aux=True)
         return by_u[0], by_u[1], by_v[1], by_u[2]
-    learns = torch.is_grad_enabled() and any(t.requires_grad for t in (pixels, *camera._tensors))
+    learns = torch.is_grad_enabled() and any(t.requires_grad for t in (pixels, *camera.tensors))
     with torch.inference_mode(False), torch.enable_grad():
         given = pixels if learns and pixels.requires_grad else pixels.detach().clone().requires_grad_()
         rays, valid = camera.unproject(given)
@@ -144,7 +144,7 @@ def local_frames(rays: Tensor, across: Tensor, down: Tensor, valid: Tensor) -> t
 def local_pinhole(camera: CameraLike, pixels: Numbers) -> tuple[Tensor, Tensor]:
     """Return rotations (..., 3, 3) and matrices K (..., 3, 3); see `Camera.local_pinhole`."""
     owner = f"{type(camera).__name__}.local_pinhole"
-    pixels, _ = as_points(pixels, "pixels", 2, camera.batch_shape, camera._tensors, owner)
+    pixels, _ = as_points(pixels, "pixels", 2, camera.batch_shape, camera.tensors, owner)
     rotation, per_unit, valid = local_frames(*tangents(camera, pixels))
     centre = torch.where(valid[..., None], pixels.to(per_unit.dtype), 0.0)
     top = torch.cat((per_unit, centre[..., None]), -1)
@@ -176,5 +176,5 @@ def perspective_field(camera: CameraLike, gravity: Numbers, stride: int) -> tupl
         latitude = torch.where(valid, torch.where(tilted, latitude, straight), 0.0)
         return latitude, up, valid.expand(latitude.shape)
 
-    latitude, up, valid = over_image(camera, camera._fields, (*camera._tensors, down), stride, field)
+    latitude, up, valid = over_image(camera, camera._fields, (*camera.tensors, down), stride, field)
     return latitude, up, valid

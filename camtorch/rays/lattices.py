@@ -35,7 +35,7 @@ def image_edges(image_size: tuple[int, int], like: Tensor) -> tuple[Tensor, Tens
 
 def image_lattice(camera: CameraLike, rows: int, columns: int) -> Tensor:
     """Return pixels (rows, columns, 2) in even steps from outer edge to outer edge of the image."""
-    return pixel_lattice(*image_edges(camera._size_for("a lattice of pixels"), camera.intrinsics), rows, columns)
+    return pixel_lattice(*image_edges(camera.size_for("a lattice of pixels"), camera.intrinsics), rows, columns)
 
 
 def pixel_lattice(low: Tensor, high: Tensor, rows: int, columns: int) -> Tensor:
@@ -86,7 +86,7 @@ def movement(camera: CameraLike, distortion: Tensor, nominal: Tensor, lattice: i
 
     The lens has `nominal` intrinsics, and is tried at so many rows and columns: finer ones come nearer to a lens's end.
     """
-    count, size = distortion.shape[-1], camera._size_for("the effect of its coefficients")
+    count, size = distortion.shape[-1], camera.size_for("the effect of its coefficients")
     batch = broadcast_shapes(nominal.shape[:-1], distortion.shape[:-1])
     intrinsics, k = (
         t.detach().double().expand(*batch, t.shape[-1]).reshape(-1, t.shape[-1]) for t in (nominal, distortion)
@@ -167,7 +167,7 @@ def around_ends(share: Tensor, valid: Tensor) -> Tensor:
 @torch.no_grad()
 def field_of_view(camera: CameraLike) -> Tensor:
     """Return angles (*B, 3) in radians along `AXES`, between outer edges or the last rays, without a graph."""
-    low, high = image_edges(camera._size_for("field_of_view"), camera.intrinsics)
+    low, high = image_edges(camera.size_for("field_of_view"), camera.intrinsics)
     (left, top), (right, bottom) = low, high
     cx, cy = camera.intrinsics.expand(*camera.batch_shape, 4)[..., 2:].clamp(low, high).unbind(-1)
     lines = (left, cy, right, cy), (cx, top, cx, bottom), (left, top, right, bottom), (left, bottom, right, top)

@@ -20,7 +20,7 @@ def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics
     owner = f"{type(camera).__name__}.project_polyline"
     if camera.batch_shape:
         raise ValueError(f"{owner}: camera must be single; got batch dims {tuple(camera.batch_shape)}. Use camera[i]")
-    points, _ = as_points(points, "points", 3, torch.Size(), camera._tensors, owner)
+    points, _ = as_points(points, "points", 3, torch.Size(), camera.tensors, owner)
     if points.ndim not in (2, 3) or points.shape[-2] < 2 or not bool(torch.isfinite(points).all()):
         what = f"shape {tuple(points.shape)}, {points.detach().tolist()!s:.200}"
         raise ValueError(f"{owner}: points must be finite, (N, 3), two or more, or (E, N, 3), lines; got {what}")

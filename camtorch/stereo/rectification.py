@@ -134,7 +134,7 @@ class Rectification(GeometryModule):
             ValueError: If a shape is wrong.
         """
         owner, camera = "disparity_to_points", self.camera_left
-        size = camera._size_for(owner)
+        size = camera.size_for(owner)
         d = as_values(disparity, "disparity", owner, camera.intrinsics.device)
         shape, batched = tuple(d.shape), bool(self.extrinsics.batch_shape or camera.batch_shape)
         if d.ndim not in ((4,) if batched else (2, 3, 4)) or shape[-2:] != size or (d.ndim > 2 and shape[-3] != 1):

@@ -69,7 +69,7 @@ def page(camera: Camera | None = None, image: Any = None) -> str:
         data["camera"] = _describe(camera)
         if image is not None:
             name = os.fsdecode(image) if isinstance(image, (str, bytes, os.PathLike)) else "image"
-            jpeg = as_jpeg(image, camera._size_for("write_viewer"), name, "write_viewer", _SIDE, _QUALITY)
+            jpeg = as_jpeg(image, camera.size_for("write_viewer"), name, "write_viewer", _SIDE, _QUALITY)
             data["photograph"] = f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}"
     # escaped, because no text may end the element that contains it
     parts = {"data": json.dumps(data, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")}
@@ -96,7 +96,7 @@ def _describe(camera: Camera) -> dict[str, Any]:
             f"write_viewer: model must be known to the page; got {camera.key or type(camera).__name__}; known are "
             f"{', '.join(sorted(models()))}. Convert it with camera.convert(...)"
         )
-    size = camera._size_for("write_viewer")
+    size = camera.size_for("write_viewer")
     intrinsics, distortion = camera.intrinsics.detach().double(), camera.distortion.detach().double()
     if (trouble := unusable(camera, intrinsics, distortion)) is not None:
         raise ValueError(f"write_viewer: camera must have pixels; got none: {trouble[0]}: {trouble[1]}")

@@ -127,7 +127,7 @@ class MirrorWarp(Warp):
             return result
         if way.box:
             left, top, right, bottom = way.box
-            images, size = images[..., top:bottom, left:right], self.target._size_for("Warp")
+            images, size = images[..., top:bottom, left:right], self.target.size_for("Warp")
             made = _resized(images, size, sampler.mode, way.flips)
             return made if out is None else out.copy_(made)
         sampler = sampler._replace(padding_mode=way.padding_mode)
@@ -140,7 +140,7 @@ class MirrorWarp(Warp):
         return render(images, where if rows is None else where.cameras(rows), *sampler)
 
     def _empty(self, images: Tensor) -> Tensor:
-        cameras, size = self.batch_shape.numel(), self.target._size_for("Warp")
+        cameras, size = self.batch_shape.numel(), self.target.size_for("Warp")
         count = len(images) if cameras == 1 else cameras
         if not are_plain(images):
             return images.new_empty(count, images.shape[1], *size)
@@ -198,16 +198,16 @@ class AffineWarp(MirrorWarp):
     def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[Way] | None:
         least: float = 1 if self.antialias else SHRINKS if self._decides else math.inf
         least, decides = least if smooth else math.inf, smooth and self._decides and route == "kept"
-        sizes = self.source._size_for("Warp"), self.target._size_for("Warp")
+        sizes = self.source.size_for("Warp"), self.target.size_for("Warp")
         return [_way(rows, *sizes, sampler.padding_mode, least, decides) for rows in self._numbers]
 
     def _inputs(self) -> list[Tensor]:
         return [self.matrix]
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
-        width = self.target._size_for("Warp")[1]
+        width = self.target.size_for("Warp")[1]
         back = inverted(self.matrix.reshape(-1, 2, 3))
-        side = back.new_tensor(self.source._size_for("Warp")[::-1])[:, None]
+        side = back.new_tensor(self.source.size_for("Warp")[::-1])[:, None]
         # pixels to positions: (2 u + 1) / W - 1
         back = torch.cat((back[:, :, :2] * 2 / side, (2 * back[:, :, 2:] + 1) / side - 1), -1)
         dtype = torch.promote_types(self.source.intrinsics.dtype, torch.float32)
@@ -281,7 +281,7 @@ def _halvings(where: Sampling | Lattice, source: Camera) -> list[int]:
     else:
         planes = where.pixels.grid.detach().movedim(-1, 1)[..., first::step, first::step]
     seen = (planes.abs() <= 1).all(1)
-    height, width = source._size_for("Warp")
+    height, width = source.size_for("Warp")
     grid, planes = planes, planes * planes.new_tensor([width / 2, height / 2])[:, None, None]
     total, count = planes.new_zeros(len(planes)), planes.new_zeros(len(planes))
     for dim in (-1, -2):

@@ -55,7 +55,7 @@ def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
 
 def _inside(warp: CameraPair, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
     """Return a lattice (N, 2) over the target, and whether (B, *M, N) polygons enclose the scene at its points."""
-    height, width = warp.target._size_for("Warp")
+    height, width = warp.target.size_for("Warp")
     host, device = warp.host, like.device
     share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device="cpu" if host else device)
     if isinstance(warp.target, PANORAMAS):

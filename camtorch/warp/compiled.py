@@ -95,10 +95,10 @@ def _warp(
     """Return images (B, C, h, w), plane by plane or with their channels last in memory; see `warped`."""
     antialias, padding, mode, padding_mode, fill, is_last = options
 
-    every = range(target._size_for("Warp")[0])
+    every = range(target.size_for("Warp")[0])
     found = partial(locate, source, target, rotation, tolerance, antialias == "True", every, padding)
-    inputs = [*source._tensors, *target._tensors, *([] if rotation is None else [rotation])]
-    where = _located(inputs, (source._form, target._form, tolerance, antialias, padding, rotation is None), found)
+    inputs = [*source.tensors, *target.tensors, *([] if rotation is None else [rotation])]
+    where = _located(inputs, (source.form, target.form, tolerance, antialias, padding, rotation is None), found)
     how: tuple[Any, Any] = mode, padding_mode
     values = tuple(ast.literal_eval(f"({fill},)"))
     return (laid(render(images, where, *how, values), is_last),)

@@ -87,7 +87,7 @@ class Dewarp(Warp):
         **options: Unpack[TolerantOptions],
     ):
         one_of(projection, tuple(_PROJECTIONS), "projection", "Dewarp")
-        own = as_sized(camera, "camera", "Dewarp")._size_for("Dewarp")
+        own = as_sized(camera, "camera", "Dewarp").size_for("Dewarp")
         size = as_image_size(image_size, "Dewarp") or own
         warn_of_exchange(own, size, "Dewarp", "warped")
         rotation = as_rotation(rotation, "Dewarp")

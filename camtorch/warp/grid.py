@@ -147,7 +147,7 @@ def locate(
             tolerance = 0.0
         return Sampling(*tabulate(source, target, rotation, tolerance, rows, padding), None)
     found = partial(tabulate, source, target, rotation, tolerance, padding=padding)
-    return scaled_rows(source, rows, target._size_for("Warp")[0], found)
+    return scaled_rows(source, rows, target.size_for("Warp")[0], found)
 
 
 def scaled_rows(
@@ -170,7 +170,7 @@ def tabulate(
     padding: str = "zeros",
 ) -> tuple[Tensor, Tensor]:
     """Return the sampling positions of a target's pixels, and which are mapped, see `Exact`; maybe by `on_lattice`."""
-    height, width = target._size_for("Warp")
+    height, width = target.size_for("Warp")
     rows = range(height) if rows is None else rows
     like = _like(target)
     if is_unknown(target.intrinsics):
@@ -211,7 +211,7 @@ def pixels_of_rows(target: Camera, rows: range) -> Tensor:
     """Return the centres of a target's pixels, (len(rows), W', 2), in the dtype to compute positions in."""
     like = _like(target)
     v = torch.arange(rows.start, rows.stop, dtype=like.dtype, device=like.device)
-    u = torch.arange(target._size_for("Warp")[1], dtype=like.dtype, device=like.device)
+    u = torch.arange(target.size_for("Warp")[1], dtype=like.dtype, device=like.device)
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
 
 
@@ -232,7 +232,7 @@ def _positions(
     seen, mapped = source.project(off_poles(source, rays))
     del rays
     mapped = mapped & has_ray
-    return to_positions(seen, mapped, source._size_for("Warp")), mapped
+    return to_positions(seen, mapped, source.size_for("Warp")), mapped
 
 
 def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
@@ -253,7 +253,7 @@ def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
 
 def local_scale(grid: Tensor, mapped: Tensor, source: Camera) -> Tensor:
     """Return (B, H', W'): how many source pixels lie between neighbours of the target, in the direction with more."""
-    height, width = source._size_for("Warp")
+    height, width = source.size_for("Warp")
     scale = grid.new_zeros(grid.shape[:-1])
     for dim in (1, 2):
         n = grid.shape[dim] - 1
@@ -277,14 +277,14 @@ def on_lattice(
     is mapped. None if that is most of the image. An edge between four nodes alone is not seen. Positions outside of the
     image that the padding does not need keep no tolerance; for "reflection" all do.
     """
-    like, (height, width) = _like(target), (len(rows), target._size_for("Warp")[1])
+    like, (height, width) = _like(target), (len(rows), target.size_for("Warp")[1])
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
     if min(n, m) < FEWEST or not native_available():
         return None
     native = _native(source, target, rotation, like)
     if native is None and not are_free(like):
         return None
-    nodes, size = (n + 5) * (m + 5), source._size_for("Warp")
+    nodes, size = (n + 5) * (m + 5), source.size_for("Warp")
     pixels = (kept_probes if nodes <= MOST_KEPT else kept_probes.__wrapped__)(rows, width, like.dtype)
     if native is not None:
         made = native.lattices(pixels, (height, width), rows.start, tolerance, padding)

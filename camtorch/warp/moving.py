@@ -21,7 +21,7 @@ def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -
     (one, other), is_batch = made
     if rotation is not None:
         is_batch, rotation = is_batch or rotation.ndim == 3, rotation.to(like.dtype)
-    return Between(one, other, rotation, end._size_for("Warp"), is_batch)
+    return Between(one, other, rotation, end.size_for("Warp"), is_batch)
 
 
 def moved_pixels(

@@ -110,7 +110,7 @@ class CameraPair(GeometryModule):
     def _options(self) -> tuple[object, ...]:
         """All that positions depend on in addition to `_inputs`."""
         source, target = self._ends
-        return source._form, target._form, self.rotation is None, self.antialias, self._tolerance
+        return source.form, target.form, self.rotation is None, self.antialias, self._tolerance
 
     @property
     def tolerance(self) -> float:
@@ -123,7 +123,7 @@ class CameraPair(GeometryModule):
     def _inputs(self) -> list[Tensor]:
         """Return all tensors that positions depend on."""
         (source, target), rotation = self._ends, self.rotation
-        found = [*source._tensors, *target._tensors]
+        found = [*source.tensors, *target.tensors]
         return found if rotation is None else [*found, rotation]
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:

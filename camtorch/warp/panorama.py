@@ -44,7 +44,7 @@ class Seam(NamedTuple):
     def before(self, camera: Camera) -> Camera:
         """Return the camera of the extended images."""
         left, right, top, bottom = self.rims
-        height, width = camera._size_for("Warp")
+        height, width = camera.size_for("Warp")
         intrinsics = camera.intrinsics + camera.intrinsics.new_tensor([0.0, 0.0, left, top])
         size = height + top + bottom, width + left + right
         return remade(camera, intrinsics=intrinsics, distortion=camera.distortion, image_size=size)
@@ -68,7 +68,7 @@ def seam_of(camera: Camera) -> Seam | None:
 
 def _found(camera: Camera, numbers: Tensor) -> Seam | None:
     axis = int(isinstance(camera, _DOWN))
-    sides = camera._size_for("Warp")[::-1]
+    sides = camera.size_for("Warp")[::-1]
     side, other = sides[axis], sides[1 - axis]
     if not len(numbers) or not bool(((math.tau * numbers[:, axis] - side).abs() < _NEAR).all()):
         return None
@@ -93,14 +93,14 @@ def goes_round(camera: Camera) -> Tensor | None:
     if not isinstance(camera, PANORAMAS) or (numbers := values_of(camera.intrinsics)) is None:
         return None
     axis, numbers = int(isinstance(camera, _DOWN)), numbers.reshape(-1, 4)
-    return numbers if bool((math.tau * numbers[:, axis] < camera._size_for("Warp")[1 - axis] + _NEAR).all()) else None
+    return numbers if bool((math.tau * numbers[:, axis] < camera.size_for("Warp")[1 - axis] + _NEAR).all()) else None
 
 
 def lengths(camera: Camera, steps: tuple[Tensor, Tensor], grid: tuple[Tensor, Tensor]) -> Tensor:
     """Return the lengths (B, h, w) of steps on a camera's image in pixels; on a panorama, as in the scene."""
     if (numbers := goes_round(camera)) is None:
         return torch.hypot(*steps)
-    axis, sides = int(isinstance(camera, _DOWN)), camera._size_for("Warp")[::-1]
+    axis, sides = int(isinstance(camera, _DOWN)), camera.size_for("Warp")[::-1]
     numbers, other = numbers[..., None, None].to(grid[0]), 1 - axis
     period = math.tau * numbers[:, axis]
     along = steps[axis] - period * (steps[axis] / period).round()
@@ -125,7 +125,7 @@ def within_turn(camera: Camera, pixels: Tensor) -> Tensor:
     """Return pixels ([B,] h, w, 2); those of a whole turn are wrapped to pixels for which the model has rays."""
     if seam_of(camera) is None:
         return pixels
-    axis, sides = int(isinstance(camera, _DOWN)), camera._size_for("Warp")[::-1]
+    axis, sides = int(isinstance(camera, _DOWN)), camera.size_for("Warp")[::-1]
     numbers, planes = camera.intrinsics.detach(), list(pixels.unbind(-1))
     numbers = numbers.reshape(*numbers.shape[:-1], *[1] * (pixels.ndim - numbers.ndim), 4)
     offset = planes[axis] - numbers[..., 2 + axis]

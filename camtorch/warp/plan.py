@@ -114,7 +114,7 @@ def warped(warp: CameraPair, images: Tensor, sampler: Sampler) -> Tensor:
         return compiled.warped(images, warp._sampled, warp.target, warp.rotation, *options)
     if route == "strips":
         cameras = math.prod(warp.batch_shape)
-        result = maker(images, len(images) if cameras == 1 else cameras, warp.target._size_for("Warp"))()
+        result = maker(images, len(images) if cameras == 1 else cameras, warp.target.size_for("Warp"))()
         kept: dict[int, Pyramid] = {}
         for rows, where in strips(warp, sampler.padding_mode):
             with torch.no_grad():
@@ -147,7 +147,7 @@ def positions(warp: CameraPair, route: Route, padding: PaddingMode = "zeros") ->
                 "do. Use torch.onnx.export(dynamo=True) or torch.export; or make the map a constant by "
                 "warp.requires_grad_(False) and one call before"
             )
-        return warp._locate(range(warp.target._size_for("Warp")[0]), padding, 0.0)
+        return warp._locate(range(warp.target.size_for("Warp")[0]), padding, 0.0)
     if records_constants() and (constant := _constant(warp, padding)):
         return constant
     reach = _reach(warp, padding)
@@ -170,7 +170,7 @@ def _computed(warp: CameraPair, reach: PaddingMode) -> Sampling | Lattice:
     if warp.tolerance and not warp.antialias and (host := warp.host) is not None:
         return positions(host, "kept", reach).on(warp.target.intrinsics.device)
     if not (_is_operator(warp) and warp.tolerance and warp.target.intrinsics.is_cpu):
-        return warp._locate(range(warp.target._size_for("Warp")[0]), reach, warp.tolerance)
+        return warp._locate(range(warp.target.size_for("Warp")[0]), reach, warp.tolerance)
     planes, mapped = compiled.positions(warp._sampled, warp.target, warp.rotation, warp.tolerance, reach)
     grid = planes.movedim(1, -1)
     return Sampling(grid, mapped, local_scale(grid, mapped, warp._sampled) if warp.antialias else None)
@@ -180,7 +180,7 @@ def strips(
     warp: CameraPair, padding: PaddingMode = "zeros", count: int | None = None
 ) -> Iterator[tuple[slice, Sampling | Lattice]]:
     """Yield rows of the target, `count` at a time, and their positions on the source's image."""
-    height, width = warp.target._size_for("Warp")
+    height, width = warp.target.size_for("Warp")
     step = count or max(_STRIP // (max(math.prod(warp.batch_shape), 1) * width), 1)
     for top in range(0, height, step):
         rows = range(top, min(top + step, height))
@@ -204,7 +204,7 @@ def in_strips(
 def on_image(warp: CameraPair, where: Sampling | Lattice) -> Tensor:
     """Whether the source maps pixels onto its image, (B or 1, 1, h, W')."""
     grid, source = where.pixels.grid.detach(), warp._sampled
-    pixels = (grid + 1) * grid.new_tensor(source._size_for("Warp")[::-1]) / 2 - 0.5
+    pixels = (grid + 1) * grid.new_tensor(source.size_for("Warp")[::-1]) / 2 - 0.5
     return (where.pixels.mapped & source.contains(pixels)).unsqueeze(1)
 
 
@@ -237,7 +237,7 @@ def _is_long(warp: CameraPair) -> bool:
     # compared first, sizes that a program leaves open would be bounded in it
     if warp.is_pinned or torch.compiler.is_compiling():
         return False
-    if math.prod((*warp.batch_shape, *warp.target._size_for("Warp"))) <= _MOST_KEPT:
+    if math.prod((*warp.batch_shape, *warp.target.size_for("Warp"))) <= _MOST_KEPT:
         return False
     return all(t.is_cpu and not is_unknown(t) for t in warp._inputs())
 

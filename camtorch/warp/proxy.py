@@ -43,7 +43,7 @@ class ProxyWarp(Warp):
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
         if not self.antialias:
             return Sampling(*self._of_rows(rows), None)
-        return scaled_rows(self._sampled, rows, self.target._size_for("Warp")[0], self._of_rows)
+        return scaled_rows(self._sampled, rows, self.target.size_for("Warp")[0], self._of_rows)
 
     def _of_rows(self, rows: range) -> tuple[Tensor, Tensor]:
         pixels = pixels_of_rows(self.target, rows)
@@ -51,7 +51,7 @@ class ProxyWarp(Warp):
         seen, mapped = self._move(pixels.expand(*batch, *pixels.shape), back=True)
         if self._seam is not None:
             seen = seen + seen.new_tensor(self._seam.rims[::2])
-        return to_positions(seen, mapped, self._sampled._size_for("Warp")), mapped
+        return to_positions(seen, mapped, self._sampled.size_for("Warp")), mapped
 
     def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         source, target = (self.target, self.source) if back else (self.source, self.target)

@@ -96,12 +96,12 @@ class Reproject(GeometryModule):
             ValueError: If shapes do not fit, or the kind is unknown. TypeError: If depth is not numeric.
         """
         owner = "Reproject"
-        size = self.source._size_for(owner)
+        size = self.source.size_for(owner)
         if not isinstance(images, Tensor) or images.ndim != 4 or tuple(images.shape[-2:]) != size:
             raise ValueError(f"{owner}: images must be a tensor (B, C, *image_size) of {size}; got {shown(images)}")
         check_devices(owner, images=images, source=self.source.intrinsics)
         check_averaged(images, self.mode, "images", owner)
-        given = as_depth(depth, kind, self.target._size_for(owner), owner, self.target.intrinsics.device)
+        given = as_depth(depth, kind, self.target.size_for(owner), owner, self.target.intrinsics.device)
         given = given if given.ndim == 4 else given[None, None]
         counts = {"images": len(images), "depth": len(given), "cameras": self.batch_shape.numel()}
         count = max(counts.values())
@@ -131,7 +131,7 @@ class Reproject(GeometryModule):
     def _seen(self, depth: Tensor, kind: str) -> tuple[Tensor, Tensor]:
         """Return source pixels (B, D, H', W', 2), and whether they are valid."""
         target = self.target
-        rays, has_ray = self._memo.unless_learning(target._tensors, target._form, target.rays)
+        rays, has_ray = self._memo.unless_learning(target.tensors, target.form, target.rays)
         if rays.ndim == 3:
             rays, has_ray = rays[None], has_ray[None]
         scale, good = depth_scale(depth, rays[:, None], has_ray[:, None], kind)

@@ -46,7 +46,7 @@ class ShiftedWarp(Warp):
         super().__init__(source, target, **options)
         self.turned_by(rotation)
         count = len(shift)
-        as_depth(depth, kind, source._size_for("RandomMount"), "RandomMount", depth.device)
+        as_depth(depth, kind, source.size_for("RandomMount"), "RandomMount", depth.device)
         with torch.no_grad():
             rays, has_ray = source.rays()
             length, known = depth_scale(depth[:, 0].to(rays), rays, has_ray, kind)
@@ -80,7 +80,7 @@ class ShiftedWarp(Warp):
 
     def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
         seen, mapped = (t[:, rows.start : rows.stop] for t in self._surface())
-        return Sampling(to_positions(seen.clone(), mapped, self.source._size_for("Warp")), mapped, None)
+        return Sampling(to_positions(seen.clone(), mapped, self.source.size_for("Warp")), mapped, None)
 
     def _move(self, pixels: Any, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         if back:
@@ -100,7 +100,7 @@ class ShiftedWarp(Warp):
     def _surface(self) -> tuple[Tensor, Tensor]:
         """Return the source's pixel (B, H', W', 2) that shows what each target pixel sees, and whether there is one."""
         if self._found is None:
-            size = self.target._size_for("Warp")
+            size = self.target.size_for("Warp")
             rays, has_ray = self.target.rays()
             far = self._nearest(size).flatten(1)
             count = len(far)

@@ -241,29 +241,29 @@ class InMotion:
         self.camera = camera
         self.shutter = shutter
         self.batch_shape: torch.Size = broadcast_shapes(camera.batch_shape, shutter.batch_shape)
-        self.size: tuple[int, int] = camera._size_for("Warp")
+        self.size: tuple[int, int] = camera.size_for("Warp")
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.camera, name)
 
     @property
-    def _tensors(self) -> tuple[Tensor, ...]:
-        return *self.camera._tensors, self.shutter.readout, self.shutter.rates
+    def tensors(self) -> tuple[Tensor, ...]:
+        return *self.camera.tensors, self.shutter.readout, self.shutter.rates
 
     @property
-    def _form(self) -> tuple[object, ...]:
-        return self.camera._form, self.shutter.direction
+    def form(self) -> tuple[object, ...]:
+        return self.camera.form, self.shutter.direction
 
     def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """Return rays and valid, as a camera does; in closed form, as a pixel fixes the time at which it is seen."""
-        pixels, _ = as_points(pixels, "pixels", 2, self.batch_shape, self.camera._tensors[:1], "Warp")
+        pixels, _ = as_points(pixels, "pixels", 2, self.batch_shape, self.camera.tensors[:1], "Warp")
         rays, valid = self.camera.unproject(pixels)
         pixels = torch.where(valid.unsqueeze(-1), pixels, 0.0)
         return self.shutter.turned(rays, self.shutter._share(pixels, self.size), 1.0), valid
 
     def project(self, rays: Tensor) -> tuple[Tensor, Tensor]:
         """Return pixels and valid, False if the scene passes as fast as rows are read, or faster."""
-        rays, _ = as_points(rays, "points", 3, self.batch_shape, self.camera._tensors[:1], "Warp")
+        rays, _ = as_points(rays, "points", 3, self.batch_shape, self.camera.tensors[:1], "Warp")
         side = self.size[1 if self.shutter.direction in ("right", "left") else 0]
 
         def seen(share: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -113,7 +113,7 @@ class Views(GeometryModule):
         the pixel. Views are averaged by their weights, and integers rounded; mode="nearest" takes the pixel of the view
         with the largest weight, as labels have no mean.
         """
-        size = self.view._size_for("Views")
+        size = self.view.size_for("Views")
         want = len(self), *size
         if not isinstance(views, Tensor) or views.ndim < 4 or (views.shape[-4], *views.shape[-2:]) != want:
             raise ValueError(

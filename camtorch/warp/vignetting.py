@@ -27,7 +27,7 @@ def vignetting(camera: Camera, power: float | Tensor = 1.0) -> Tensor:
     Raises:
         ValueError: If the camera has no image_size, or powers do not fit it. TypeError: If power is not numeric.
     """
-    height, width = as_sized(camera, "camera", "vignetting")._size_for("vignetting")
+    height, width = as_sized(camera, "camera", "vignetting").size_for("vignetting")
     with torch.no_grad():
         rays, valid = camera.rays()
         cosine = torch.where(valid, rays[..., 2], _LEAST).reshape(-1, 1, height, width).clamp(_LEAST, 1.0)

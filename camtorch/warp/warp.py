@@ -167,7 +167,7 @@ class Warp(CameraPair):
         """Return the result of `forward` for images that no kept call fits."""
         if not isinstance(images, Tensor):
             warp = partial(self.forward, mode=mode, padding_mode=padding_mode, fill=fill)
-            return warped_alike(images, self.source._size_for("Warp"), "Warp", warp, self.source.intrinsics.device)
+            return warped_alike(images, self.source.size_for("Warp"), "Warp", warp, self.source.intrinsics.device)
         sampler = checked(self, images, mode, padding_mode, fill)
         if images.ndim == 4:
             return self._warped(images, sampler)
@@ -231,7 +231,7 @@ class Warp(CameraPair):
         where, seam = plan.by_pixel(self), self._seam
         if seam is None:
             return where.grid.clone(memory_format=torch.contiguous_format)
-        grid = seam.on_image(where.grid, self.source._size_for("Warp"))
+        grid = seam.on_image(where.grid, self.source.size_for("Warp"))
         return torch.where(where.mapped.unsqueeze(-1), grid, OUTSIDE)
 
     def valid_mask(self) -> Tensor:
@@ -335,7 +335,7 @@ def checked(
     warp: Warp, images: Tensor, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None
 ) -> Sampler:
     """Return how a warp samples images in one call; raise if images or options are wrong."""
-    expected = warp.source._size_for("Warp")
+    expected = warp.source.size_for("Warp")
     if not isinstance(images, Tensor) or images.dtype.is_complex:
         what = images.dtype if isinstance(images, Tensor) else type(images).__name__
         raise TypeError(f"Warp: images must be a tensor (B, C, H, W) of real numbers; got {what}")

@@ -89,7 +89,7 @@ class Learning(dict):
 
     def __getitem__(self, name):
         out = moved(super().__getitem__(name)(None), camera=lens_of())
-        return {n for n, v in out.items() if any(t.requires_grad for t in getattr(v, "_tensors", (v,)))}
+        return {n for n, v in out.items() if any(t.requires_grad for t in getattr(v, "tensors", (v,)))}
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")

@@ -182,7 +182,7 @@ def test_a_batch_is_its_rows_one_by_one(target, options):
         alone = row.convert(target, **options)
         for name in ("rms", "max_error", "max_angle", "valid_fraction"):
             torch.testing.assert_close(getattr(together, name)[i, j], getattr(alone, name), rtol=1e-7, atol=1e-9)
-        for whole, part in zip(together.camera[i, j]._tensors, alone.camera._tensors, strict=True):
+        for whole, part in zip(together.camera[i, j].tensors, alone.camera.tensors, strict=True):
             torch.testing.assert_close(whole, part, rtol=1e-7, atol=1e-8)
 
 

@@ -31,7 +31,7 @@ def test_a_step_moves_the_image_by_lr_pixels(key):
     near.intrinsics.data[:2] *= 0.8
     for made, parts in ((camera, [camera]), (copy.deepcopy(ct.cat(rows)), rows)):  # a copy has leaves of its own
         groups = made.parameter_groups(lr=0.01)
-        assert [id(*group["params"]) for group in groups] == [id(t) for t in made._tensors if t.requires_grad]
+        assert [id(*group["params"]) for group in groups] == [id(t) for t in made.tensors if t.requires_grad]
         assert [groups[0]["lr"], *(group["weight_decay"] for group in groups)] == [0.01, *[0] * len(groups)]
         for group in groups[1:]:  # a lens that ends on the image is measured a little inside
             assert max(pixels_moved_at_most(part, group["lr"]) for part in parts) == pytest.approx(0.01, rel=0.25)

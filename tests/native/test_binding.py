@@ -50,7 +50,7 @@ def test_no_guard_of_a_call_goes_with_python_minus_o():
 @has_library
 def test_rows_of_other_cameras_and_shapes_are_errors_before_a_call():
     camera = ct.Pinhole([[1.0, 1, 0, 0]] * 2, image_size=(2, 2))
-    native = camera_rows(camera, *(t.detach() for t in camera._tensors)).native
+    native = camera_rows(camera, *(t.detach() for t in camera.tensors)).native
     with pytest.raises(ValueError, match="must be of 2 cameras; got those of 3"):
         compiled.project(native, torch.ones(3, 4, 3))
     with pytest.raises(ValueError, match=re.escape("must be of (2, 4) rows; got (2, 5)")):
