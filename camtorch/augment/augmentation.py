@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -13,9 +13,10 @@ from typing_extensions import Unpack
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds, check_sizes
 from camtorch.augment.elsewhere import Elsewhere, remember_camera, twin_of
 from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.kinds import BOXES, FRONT_ENDS, Named, as_corners
-from camtorch.augment.ranges import Range, Spans, draw
-from camtorch.augment.sample import Batch, Sample, SampleOptions, SampleTransform, on_samples
+from camtorch.augment.kinds import BOXES, FRONT_ENDS, as_corners
+from camtorch.augment.plan import Batch, Plan
+from camtorch.augment.ranges import Range, draw
+from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.door import may_look
@@ -126,10 +127,6 @@ class Augmentation(SampleTransform):
     p: float
     same_on_batch: bool
     min_filled: float | None
-    _last: Change | Callable[[], Change] | None = None
-    _is_first: bool = False  # whether the last sample came without a rotation
-    _warned: bool = False
-    _spans: Spans | None = None
 
     def __init__(
         self,
@@ -149,9 +146,7 @@ class Augmentation(SampleTransform):
     @property
     def last(self) -> Change | None:
         """The change of the last call: its `source`, `target` and `rotation`."""
-        if callable(made := self._last):
-            made = self.__dict__["_last"] = made()
-        return made
+        return self._calls.last
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """Return the camera after, with an image_size, and the rotation, `ray_after = R ray_before`, or None.
@@ -192,7 +187,7 @@ class Augmentation(SampleTransform):
 
     def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
         """Return the draw as lists, arrays or tensors; see the function `draw`."""
-        values, self.__dict__["_spans"] = draw(self.ranges, count, p, same_on_batch, generator, self._spans)
+        values, self._calls.spans = draw(self.ranges, count, p, same_on_batch, generator, self._calls.spans)
         return values
 
     def with_boxes(self, draw: Mapping[str, Any], boxes: Tensor | Sequence[Tensor] | None) -> Mapping[str, Any]:
@@ -222,11 +217,11 @@ class Augmentation(SampleTransform):
         if camera is None:
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
             raise ValueError(f"{self._name}: camera must be given; got None. Please {how}. {GUESS_CAMERA}")
-        return self._changed(as_one(camera), self._checked_draw(draw))
+        return self._changed(alone(as_one(camera)), self._checked_draw(draw))
 
     def _changed(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         """Return the change of a draw, computed on the CPU if the draw is there and the camera elsewhere, unlearnt."""
-        twin = twin_of(camera) if self.drawn_on_host else None
+        twin = None if camera.intrinsics.is_cpu or not self.drawn_on_host else twin_of(camera)
         if twin is None or not all(getattr(value, "is_cpu", True) for value in draw.values()):
             return self._change(camera, draw)
         return Elsewhere(self._change(twin, draw), camera.intrinsics.device)
@@ -246,7 +241,10 @@ class Augmentation(SampleTransform):
         looks = not isinstance(applied, Tensor) or may_look(applied) or count == 0
         chosen = applied if isinstance(applied, list) else applied.tolist() if looks else []
         if all(chosen):  # traced, all rows move, and a gate chooses
-            return by_kinds(count, camera, part, None if looks or self.p == 1 else applied)
+            gate = None if looks or self.p == 1 else applied
+            if not isinstance(camera, Mixed):
+                return Change(count, [self._part(None, camera, draw)], gate=gate)
+            return by_kinds(count, camera, part, gate)
         parts, camera = [], alone(camera)
         for rows, group in camera.groups if isinstance(camera, Mixed) else [(list(range(count)), camera)]:
             for moves in (True, False):
@@ -298,9 +296,10 @@ class Augmentation(SampleTransform):
 
     def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
         """Return what was drawn, (*B,) or (*B, size), where all is alike once: one map then serves all samples."""
+        if isinstance(draw["apply"], list):  # of one sample
+            return {name: value[0] for name, value in draw.items() if name != "apply"}
         values = {name: value for name, value in draw.items() if name != "apply"}
-        several = source.batch_shape or (len(draw["apply"]) != 1 and not all(map(_are_alike, values.values())))
-        if several and not isinstance(draw["apply"], list):
+        if source.batch_shape or (len(draw["apply"]) != 1 and not all(map(_are_alike, values.values()))):
             return values
         return {n: value[0].tolist() if isinstance(value, np.ndarray) else value[0] for n, value in values.items()}
 
@@ -324,9 +323,9 @@ class Augmentation(SampleTransform):
     def _tell_of(self, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor) -> None:
         """Warn, once, if filled parts (*B,) are less than `min_filled` with these factors (*B,) on focal lengths."""
         share = self.min_filled or 0.0
-        if self._warned or not known_false(found >= share):
+        if self._calls.warned or not known_false(found >= share):
             return
-        self._warned, few = True, int((found < share).sum())
+        self._calls.warned, few = True, int((found < share).sum())
         warn(
             f"{self._name}: min_filled must be within reach; got {share:g}, and of {few} of {found.numel()} new images "
             f"down to {float(found.min()):.0%} shows something: the camera of the images does not see along the axis "
@@ -335,12 +334,12 @@ class Augmentation(SampleTransform):
 
     def tell_of_empty_images(self, camera: Camera) -> None:
         """Warn, once, if new images of such cameras will be mostly empty, as some draws apart from all others say."""
-        if self.min_filled is not None or self._warned or self.p == 0:
+        if self.min_filled is not None or self._calls.warned or self.p == 0:
             return
         camera = camera[0] if camera.is_mixed else camera
         if not are_known(camera.intrinsics):
             return
-        self._warned = True
+        self._calls.warned = True
         values, _ = draw(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
         with torch.no_grad():
             first = camera.detach()
@@ -381,28 +380,19 @@ class Augmentation(SampleTransform):
                 field that might be geometry, a draw of another size. TypeError: a field that is no tensor.
         """
         sample = self._given(sample, fields)
-        numbers = None
-        if draw is None:
-            moved, numbers = self._quickly(sample, generator)
-            if moved is not None:
-                return moved
         if clips := self._clips(sample):
             own = sample.get("camera")
             own = self.camera if own is None else own
             frames = clips.frames(alone(own) if isinstance(own, Camera) else own)
             drawn = self.drawn(clips.shape[0], self.p, self.same_on_batch, generator) if draw is None else draw
             each = clips.shape[1]  # of what a draw needs of a sample, that of the first frame counts
-            first = {n: (kind, value[::each]) for n, (kind, value) in self._sorted(frames, self.fields).items()}
+            named = self._sorted(frames, self.fields)
+            firsts = {name: value[::each] for name, (_, value) in named.items()}
+            plan = Plan({name: kind for name, (kind, _) in named.items()}, True, clips.shape[0], ())
+            first = Batch(plan, firsts, cast("Any", own), True)
             draw = {n: clips.repeated(value, f"draw[{n!r}]") for n, value in self._of_sample(drawn, first).items()}
             return clips.restored(self.forward(frames, draw=draw))
-        return self._augmented(sample, draw=draw, generator=generator, numbers=numbers)[0]
-
-    def _quickly(self, sample: Sample, generator: torch.Generator | None) -> tuple[Sample | None, Any]:
-        """Move a sample of a form that was moved before; or return None, and what was drawn for it, if anything was."""
-        return None, None
-
-    def _prepare(self, sample: Sample, batch: Batch, change: Change) -> None:
-        """Prepare for more samples of the form of one that was moved."""
+        return self._augmented(sample, draw=draw, generator=generator)[0]
 
     def _augmented(
         self,
@@ -410,20 +400,15 @@ class Augmentation(SampleTransform):
         kinds: Mapping[str, str] | None = None,
         draw: Mapping[str, Tensor] | None = None,
         generator: torch.Generator | None = None,
-        numbers: Any = None,
     ) -> tuple[Sample, Change]:
-        """Return a sample moved by one change, and the change.
-
-        kinds: name -> kind, in addition to `fields`. numbers: what was drawn, if it was.
-        """
+        """Return a sample moved by one change, and the change; kinds: name -> kind, in addition to `fields`."""
         batch = self._batch(sample, kinds=kinds)
-        named, form, camera = batch
-        count = form.count
+        plan, camera, count = batch.plan, batch.camera, batch.plan.count
         if draw is None:
-            numbers = self._numbers(count, self.p, self.same_on_batch, generator) if numbers is None else numbers
-            change = self._changed(camera, self._of_sample(numbers, named))
+            numbers = self._numbers(count, self.p, self.same_on_batch, generator)
+            change = self._changed(camera, self._of_sample(numbers, batch))
         else:
-            change = self.change(camera, self._of_sample(draw, named))
+            change = self.change(camera, self._of_sample(draw, batch))
         if change.count != count:
             one = f"{{name: value.expand({count}, *value.shape[1:]) for name, value in draw.items()}} uses it for all"
             raise ValueError(
@@ -431,14 +416,12 @@ class Augmentation(SampleTransform):
                 f"for each{f', {one}' if change.count == 1 else ''}"
             )
         if not torch.compiler.is_compiling():
-            self.__dict__["_is_first"] = "rotation" not in named
-            self.__dict__["_last"] = change  # as nn.Module would, after some questions
-            if count and not self._warned and "image" in [found for found, _ in named.values()]:
+            self._calls.is_first, self._calls.last = "rotation" not in plan.fields, change
+            if count and not self._calls.warned and "image" in plan.fields.values():
                 self.tell_of_empty_images(change.host.source if isinstance(change, Elsewhere) else camera)
         moved = self._moved(sample, batch, change)
-        self._prepare(sample, batch, change)
         if isinstance(change, Elsewhere) and isinstance(moved.get("camera"), Camera):
-            remember_camera(moved["camera"], change.host.target if form.batched else change.host.single)
+            remember_camera(moved["camera"], change.host.target if plan.batched else change.host.single)
         return moved, change
 
     @on_samples
@@ -469,7 +452,7 @@ class Augmentation(SampleTransform):
                 f"{self._name}: inverse must have a change to invert; got none. Call it first, or give draw= and "
                 "camera="
             )
-        turned = sample.get("rotation") if draw is None and self._is_first else None
+        turned = sample.get("rotation") if draw is None and self._calls.is_first else None
         if "camera" in sample and not change.leads_to(sample["camera"], turned):
             raise ValueError(
                 f"{self._name}: camera and rotation of the sample must be those that this change made; got "
@@ -477,11 +460,11 @@ class Augmentation(SampleTransform):
             )
         return self.moved_by(change.inverse(), sample, predicted=True)
 
-    def _of_sample(self, draw: Mapping[str, Any], named: Named) -> Mapping[str, Any]:
+    def _of_sample(self, draw: Mapping[str, Any], batch: Batch) -> Mapping[str, Any]:
         """Add to a draw the boxes that it needs of a sample: those named `boxes`, or the first of that kind."""
         if not self.crops:
             return draw
-        found: dict[str, Any] = {name: pair for name, pair in named.items() if pair[0] in BOXES}
+        found: dict[str, Any] = {name: pair for name, pair in batch.rows().items() if pair[0] in BOXES}
         kind, boxes = found.get("boxes", next(iter(found.values()), ("boxes", None)))
         if kind != "boxes":
             boxes = [as_corners(kind, b) for b in boxes] if isinstance(boxes, list) else as_corners(kind, boxes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import torch
@@ -41,7 +41,7 @@ def as_is(camera: Camera, rows: Tensor) -> Tensor:
     return rows
 
 
-@dataclass
+@dataclass(slots=True)
 class Drawn:
     """New cameras as compiled code wrote their numbers, of which modules are made when somebody asks for them."""
 
@@ -53,17 +53,20 @@ class Drawn:
     options: Options  # of the warp that leads to them
     start: Native | None  # the cameras before, for compiled code
     native: Native | None  # these ones; None where they have to be found
-    factor: Tensor  # (B,), on the focal lengths, that `min_filled` asks for
-    found: Tensor  # (B,): the share of each image that is filled
+    factor: Sequence[float]  # (B,), on the focal lengths, that `min_filled` asks for
+    found: Sequence[float]  # (B,): the share of each image that is filled
     is_turn: bool = True  # of a single one: whether the rotation is no mirror
     made: Warp | None = field(default=None, init=False)  # the warp, once somebody has asked for it
+    own: Camera | None = field(default=None, init=False)  # the target, likewise
 
-    @cached_property
+    @property
     def target(self) -> Camera:
         """The one of the change, which nobody else gets."""
-        if self.native is not None:
-            _ = self.native.lenses  # kept for cameras of the same numbers
-        return self.camera()
+        if self.own is None:
+            if self.native is not None:
+                _ = self.native.lenses  # kept for cameras of the same numbers
+            self.own = self.camera()
+        return self.own
 
     def camera(self) -> Camera:
         if torch.is_inference_mode_enabled():  # what that makes could not be used in a graph later
@@ -79,7 +82,7 @@ class Drawn:
         return self.made
 
 
-@dataclass
+@dataclass(slots=True)
 class Part:
     """Rows of a batch that move by one warp, or stay as they are."""
 
@@ -190,6 +193,7 @@ class Change:
         gate: (count,) bool, where values may not be looked at: which rows of the only part move.
     """
 
+    __slots__ = ("_inverse", "_order", "count", "gate", "mixed", "parts")
     count: int
     parts: list[Part]
     mixed: bool
@@ -197,9 +201,11 @@ class Change:
 
     def __init__(self, count: int, parts: Sequence[Part], *, mixed: bool = False, gate: Tensor | None = None):
         self.count, self.parts, self.mixed, self.gate = count, list(parts), mixed, gate
-        rows = [row for part in self.parts for row in part.rows or ()]
         self._inverse: Change | None = None
-        self._order: list[int] | None = sorted(range(len(rows)), key=rows.__getitem__) if rows else None
+        self._order: list[int] | None = None
+        if self.parts[0].rows is not None:
+            rows = [row for part in self.parts for row in part.rows or ()]
+            self._order = sorted(range(len(rows)), key=rows.__getitem__) if rows else None
 
     @property
     def source(self) -> Camera:
@@ -219,25 +225,25 @@ class Change:
     @property
     def single(self) -> Camera:
         """Return the camera after, of a change of one sample; its own, not that of the change."""
-        if isinstance(view := self.parts[0].moves, Drawn):
-            return view.camera()
+        if isinstance(moves := self.parts[0].moves, Drawn):
+            return moves.camera()
         return (self.target[0] if self.gate is not None else alone(self.parts[0].target)).clone()
 
     @property
     def several(self) -> Camera:
         """Return the cameras after, a batch of all samples; their own, not those of the change."""
-        view = self.parts[0].moves
-        if isinstance(view, Drawn) and self._order is None and not self.mixed and view.intrinsics.ndim == 2:
-            return view.camera()
+        moves = self.parts[0].moves
+        if isinstance(moves, Drawn) and self._order is None and not self.mixed and moves.intrinsics.ndim == 2:
+            return moves.camera()
         return self.target.clone()
 
     @property
     def single_rotation(self) -> Tensor:
         """(3, 3): the rotation of a change of one sample, of its own memory."""
-        view = self.parts[0].moves
-        if not isinstance(view, Drawn):
+        moves = self.parts[0].moves
+        if not isinstance(moves, Drawn):
             return self.rotation[0].clone()
-        return (no_turn(view.distortion.dtype) if view.rotation is None else view.rotation).clone()
+        return (no_turn(moves.distortion.dtype) if moves.rotation is None else moves.rotation).clone()
 
     def leads_to(self, camera: Camera | Sequence[Camera], rotation: Tensor | None = None) -> bool:
         """Whether these may be the cameras after, by number, intrinsics and rotation, where one may look."""

@@ -5,27 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
-from functools import partial
-from typing import Any, ClassVar, Literal, NamedTuple, cast
+from typing import Any, ClassVar, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, FilledOptions
-from camtorch.augment.change import Change, Drawn, Part, no_turn
-from camtorch.augment.drawing import One, Start
+from camtorch.augment.change import Drawn, Part
+from camtorch.augment.drawing import Start
 from camtorch.augment.elsewhere import twin_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.jitter import jittered
-from camtorch.augment.kinds import CHECKED, Form, check_values
 from camtorch.augment.presets import PRESETS
-from camtorch.augment.ranges import Range, RangeLike, as_range, draw_shares
-from camtorch.augment.sample import Batch, Sample
+from camtorch.augment.ranges import Range, RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.catalogue import ELSEWHERE
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import are_free, are_numbers, known_false, with_derivatives_of
+from camtorch.evaluate.known import are_numbers, known_false, with_derivatives_of
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.native.structs import AMOUNTS
@@ -35,7 +32,6 @@ from camtorch.rays.lattices import field_of_view
 from camtorch.values.arguments import LEFT, as_image_size, broadcast_shapes, check_degrees, warn
 from camtorch.values.module import remade
 from camtorch.warp.panorama import PANORAMAS
-from camtorch.warp.plan import SampleCall
 from camtorch.warp.vignetting import vignetting
 from camtorch.warp.warp import Warp
 
@@ -203,7 +199,8 @@ class CameraDrawer(Augmentation):
         """Return what compiled code makes of a draw; None where something is recorded, or it does not know a model."""
         if type(self).new_camera is not CameraDrawer.new_camera:
             return None
-        if isinstance(next(iter(values.values()), None), Tensor) or not are_numbers(*self._tensors_of(source)):
+        tensors = self._tensors_of(source)
+        if isinstance(next(iter(values.values()), None), Tensor) or not are_numbers(*tensors):
             return None
 
         def start() -> Start | None:
@@ -212,19 +209,24 @@ class CameraDrawer(Augmentation):
             nominal = self._nominal(base, sized, size, values) if moves else None
             return Start.of(source, base, sized, reach, size, [*values], nominal, share)
 
-        tensors = self._tensors_of(source)
-        found = start() if self._is_real else self._memo(tensors, self._key(source, values, share), start)
+        if self._is_real:
+            found = start()
+        else:
+            key = self._key(source, values, share)
+            known = self._memo.entry(tensors, key)
+            found = self._memo(tensors, key, start) if known is None else known[2]
         own = self.like is None and not self._is_real
         return None if found is None else found.drawn(values, source if own else found.base, self.options)
 
     def _tensors_of(self, source: Camera) -> tuple[Tensor, ...]:
         """Return the tensors that new cameras depend on."""
-        like = self._like_for(source)
-        return source.tensors if like is None else (*source.tensors, *like.tensors)
+        if self.like is None:
+            return source.tensors
+        return *source.tensors, *self._like_for(source).tensors  # type: ignore[union-attr]
 
     def _key(self, source: Camera, names: Iterable[str], share: float | None) -> tuple[Any, ...]:
         """Return all else that what new cameras are drawn from depends on."""
-        own = self._revision, self.like and self.like.image_size, self.ranges.get("fov"), share
+        own = self._calls.revision, self.like and self.like.image_size, self.ranges.get("fov"), share
         return "start", type(source), source.image_size, self._size_of(source), *names, *own
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
@@ -232,93 +234,14 @@ class CameraDrawer(Augmentation):
         made = self._drawn(source, values, self.min_filled)
         if made is None:
             return super()._part(rows, source, draw)
-        if self.min_filled:
-            self._tell_of(source, lambda: made.target, made.factor, made.found)
+        if self.min_filled and (min(made.found, default=1) < self.min_filled or max(made.factor, default=1) > 1):
+            factor, found = (torch.tensor(values, dtype=torch.float64) for values in (made.factor, made.found))
+            self._tell_of(source, lambda: made.target, factor, found)
         simple = self.options["tolerance"] and not self.options["antialias"] and made.native is not None
         simple = simple and self.beside_the_camera.isdisjoint(self.ranges)
         if simple and not isinstance(source, PANORAMAS) and not isinstance(made.base, PANORAMAS):
             return Part(rows, made, source)
         return self._between(rows, source, values, made.target, made.rotation)
-
-    def _prepare(self, sample: Sample, batch: Batch, change: Change) -> None:
-        form, moves = batch.form, change.parts[0].moves
-        if form.is_tried or form.batched or self.valid_mask or self.mirroring is not None or self._is_real:
-            return
-        form.is_tried, names, call = True, form.names, form.call
-        flags = {"image_valid", *(f"{name}_valid" for name, _ in form.fields)}
-        if call is None or not call.keeps_dtypes or not isinstance(moves, Drawn) or not flags.isdisjoint(sample):
-            return
-        key = self._key(batch.camera, self.ranges, self.min_filled)
-        known = self._memo.entry(self._tensors_of(batch.camera), key)
-        if known is not None and known[2] is not None and known[2].is_quick and known[2].names == [*self.ranges]:
-            options, *more = self._settings()
-            rest = [(name, found) for name, found in form.fields if name not in names]
-            checked = [(name, found) for name, found in rest if found in CHECKED]  # the call looks at the others
-            turns = all(name != "rotation" for name, _ in form.fields)
-            form.ready = Ready(({**options}, *more), key, names, call, rest, checked, turns)
-
-    def _settings(self) -> tuple[Any, ...]:
-        """Return what the calls for samples of a form depend on, in addition to the form and the cameras' numbers."""
-        return self.options, [*self.ranges.items()], self._revision, self.like and self.like.image_size
-
-    def _quickly(self, sample: Sample, generator: torch.Generator | None) -> tuple[Sample | None, Any]:
-        camera = self.camera if (given := sample.get("camera")) is None else given
-        key, settings = self._form_of(sample, camera, self.fields), self._settings()
-        entry = None if key is None else self._forms.entry((), key)
-        form: Form | None = None if entry is None else entry[2]
-        ready: Ready | None = None if form is None else form.ready
-        # what is made in inference mode could not be used in a graph later
-        if form is None or ready is None or camera is None or torch.is_inference_mode_enabled():
-            return None, None
-        if ready.settings != settings:
-            form.is_tried, form.ready = False, None
-            return None, None
-        options, like = self.options, self.like
-        gate, shares, spans = draw_shares(self.ranges, 1, self.p, generator, self._spans)
-        self.__dict__["_spans"] = spans
-        applied, numbers = self.p >= 1 if gate is None else bool(gate), spans.numbers(shares.tolist())
-        tensors = camera.tensors if like is None else (*camera.tensors, *like.tensors)
-        fields = [sample[name] for name in ready.names]
-        known = self._memo.entry(tensors, ready.key) if applied and are_free(*tensors, *fields) else None
-        for name, found in ready.checked:
-            check_values(found, name, sample[name], self._name)
-        if known is not None:
-            start: Start = known[2]
-            one = start.one(numbers)
-            moved = None if one is None else ready.call(start.before, one.native, one.rotation, fields)
-            if one is not None and moved is not None and None not in moved:
-                base = camera if like is None else start.base
-                self.__dict__["_is_first"] = ready.turns
-                drawn_again = partial(start.again, one, base, options.copy())
-                self.__dict__["_last"] = lambda: Change(1, [Part(None, drawn_again(), camera)])
-                return self._sample_after(sample, ready, start, one, base, moved), None
-        return None, {"apply": [applied], **spans.named(numbers)}
-
-    def _sample_after(
-        self, sample: Sample, ready: Ready, start: Start, one: One, base: Camera, moved: Iterable[Any]
-    ) -> Sample:
-        """Return a sample with the fields that a call has moved, those that take their own ways, and the new camera."""
-        result = dict(sample)
-        for name, (value, valid) in zip(ready.names, moved, strict=True):
-            result[name] = value
-            if valid is not None:
-                result[f"{name}_valid"] = valid
-        if self.min_filled or ready.rest:
-            change = cast("Change", self.last)
-            if self.min_filled:
-                made = cast("Drawn", change.parts[0].moves)
-                self._tell_of(change.parts[0].camera, lambda: made.target, made.factor, made.found)
-            for name, found in ready.rest:
-                value, valid = self._one(change, found, sample[name][None], {"mask_fill": self.mask_fill})
-                result[name] = value.squeeze(0)
-                if valid is not None:
-                    result[f"{name}_valid"] = valid.squeeze(0)
-        if ready.turns:
-            result["rotation"] = no_turn(start.dtype).clone() if one.rotation is None else one.rotation
-        k = nn.Parameter(one.distortion, requires_grad=False) if len(one.distortion) else one.distortion
-        intrinsics = nn.Parameter(one.intrinsics, requires_grad=False)
-        result["camera"] = remade(base, intrinsics=intrinsics, distortion=k, image_size=start.size)
-        return result
 
     def _warp(self, source: Camera, target: Camera, rotation: Tensor | None) -> Warp:
         return Warp.unchecked(source, target, self.options).turned_by(rotation)
@@ -407,18 +330,6 @@ class CameraDrawer(Augmentation):
 
         key = "source", type(source), source.image_size, type(base), base.image_size, size
         return self._memo(source.tensors + base.tensors, key, narrowed)
-
-
-class Ready(NamedTuple):
-    """The common state of single samples of one form that two calls of compiled code move."""
-
-    settings: tuple[Any, ...]  # of the drawer
-    key: tuple[Any, ...]  # of the cameras to draw from
-    names: list[str]  # of the fields that the call moves
-    call: SampleCall
-    rest: list[tuple[str, str]]  # names and kinds of the other fields
-    checked: list[tuple[str, str]]  # of those whose values are checked
-    turns: bool  # whether the rotation comes out as a new field
 
 
 def _joined(numbers: Sequence[Tensor], like: Tensor) -> Tensor:

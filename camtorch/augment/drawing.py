@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from ctypes import addressof, c_double
-from functools import partial
-from typing import Any, NamedTuple
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,6 +31,12 @@ _KINDS = {"yaw": structs.YAW, "pitch": structs.PITCH, "roll": structs.ROLL, "zoo
 _KINDS |= {"focal": structs.FOCAL, "centre": structs.CENTRE, "distortion": structs.DISTORTION, "crop": structs.CROP}
 _KINDS["place"] = structs.PLACE
 _TURNS = {"yaw", "pitch", "roll"}
+
+
+@lru_cache(maxsize=64)
+def _doubles(count: int) -> Any:
+    """Return the type of an array; ctypes makes a new one each time, in more time than the array takes."""
+    return c_double * count
 
 
 class Start:
@@ -118,42 +124,8 @@ class Start:
         self._knows, call.places = True, self._keep(plan.places)
         self._room += plan.parameters + 4 + TABLE_WIDTH
 
-    @property
-    def is_quick(self) -> bool:
-        """Whether `one` makes a camera of most draws."""
-        return not self._rows and self._native.cameras == 1 and (self._knows or not self._moves)
-
-    def one(self, values: Sequence[float]) -> One | None:
-        """Return the only new camera of values in a row, as they were drawn; None if it wants more than one call."""
-        call, dtype = structs.Draws.from_buffer_copy(self._call), self.dtype
-        numbers = (c_double * (len(values) + 2))(1, 1, *values)  # after the factor, and what is filled
-        room, intrinsics = torch.empty(self._room, dtype=dtype, device="cpu"), torch.empty(4, dtype=dtype, device="cpu")
-        distortion = torch.empty(call.count, dtype=dtype, device="cpu") if self._moves else self._distortion.clone()
-        rotation = torch.empty(3, 3, dtype=dtype, device="cpu") if self._turns else None
-        call.cameras = call.made.cameras = 1
-        call.room, call.factors = room.data_ptr(), addressof(numbers)
-        call.filled, call.values = call.factors + 8, call.factors + 16
-        turns, moves = None if rotation is None else rotation.data_ptr(), distortion.data_ptr() if self._moves else None
-        call.copies[:] = intrinsics.data_ptr(), turns, moves
-        kept = [room, *self._add_limits(call, 1)]
-        if loaded().camtorch_draws(call):
-            return None
-        if not call.followed and self._moves:
-            call.made.limits2 = call.made.extent = None
-        return One(self._made(call, kept, 1), room, intrinsics, distortion, rotation, *numbers[:2])
-
-    def again(self, one: One, base: Camera, options: Options) -> Drawn:
-        """Return what was made, in memory of its own, as `drawn` does."""
-        count, k = self._call.count, self._distortion
-        intrinsics, rotation = one.room[:4], one.room[4:13].view(3, 3) if self._turns else None
-        k = one.room[13 : 13 + count] if self._moves else k
-        factor, found = (torch.tensor([value], dtype=torch.float64) for value in (one.factor, one.filled))
-        return Drawn(base, intrinsics, k, self.size, rotation, options, self.before, one.native, factor, found)
-
-    def _add_limits(self, call: structs.Draws, rows: int) -> list[Tensor]:
-        """Give room for the limits of new lenses, if some have wanted them."""
-        if not self._follows:
-            return []
+    def _limits(self, call: structs.Draws, rows: int) -> list[Tensor]:
+        """Give room for the limits of new lenses."""
         kept = [
             torch.empty(rows * count, dtype=self._native.dtype, device="cpu")
             for count in (structs.AZIMUTHS, structs.EXTENT)
@@ -171,22 +143,28 @@ class Start:
         """Return the new cameras, modules like `base`, of values (B,) and (B, size), or numbers and lists for one."""
         call, native = structs.Draws.from_buffer_copy(self._call), self._native
         given = [values[name] for name in self.names]
-        several = [len(value) for value in given if isinstance(value, np.ndarray)]
-        rows, is_one = self._rows or (several[0] if several else 1), not (self._rows or several)
+        first = given[0] if given else None
+        rows = self._rows or (len(first) if isinstance(first, np.ndarray) else 1)
+        is_one = not self._rows and not isinstance(first, np.ndarray)
+        filled = _doubles(2 * rows)()  # the factors, and what is filled
+        numbers: Any
         if is_one:
-            flat = [number for value in given for number in (value if isinstance(value, list) else (value,))]
-            numbers: Any = (c_double * len(flat))(*flat)
+            flat: list[float] = []
+            for value in given:
+                flat += value if isinstance(value, list) else (value,)
+            numbers = _doubles(len(flat))(*flat)
             call.values = addressof(numbers)
         elif given:
             numbers = np.concatenate(given, None)
             call.values = numbers.ctypes.data
-        room = torch.empty(rows * self._room, dtype=native.dtype, device="cpu")
+        room = torch.empty(rows * self._room, dtype=self.dtype, device="cpu")
         call.cameras = call.made.cameras = rows
-        call.room = room.data_ptr()
-        filled = torch.empty(2, rows, dtype=torch.float64, device="cpu")
-        call.factors, call.filled = filled.data_ptr(), filled.data_ptr() + 8 * rows
+        call.room, call.factors = room.data_ptr(), addressof(filled)
+        call.filled = call.factors + 8 * rows
         tries = self._tries(values, rows, call) if self._moves and not self._knows else None
-        kept, run = [room, *self._add_limits(call, rows)], loaded().camtorch_draws
+        kept, run = [room], loaded().camtorch_draws
+        if self._follows:  # some lenses have wanted limits
+            kept += self._limits(call, rows)
         while (left := run(call)) & ~structs.NO_CAMERA:
             if left & structs.TOO_WIDE:
                 widest = np.max(values["fov"])
@@ -204,23 +182,23 @@ class Start:
                 tries.follow()
             elif left & structs.LEFT_LENS:
                 self._follows = True
-                kept += self._add_limits(call, rows)
+                kept += self._limits(call, rows)
         if call.followed < rows and self._moves:
             call.made.limits2 = call.made.extent = None
-        intrinsics, rotation, k = room[: 4 * rows], room[4 * rows : 13 * rows], self._distortion
-        if self._moves:
-            k = room[13 * rows : (13 + call.count) * rows].view(rows, call.count)
+        intrinsics, rotation = room[: 4 * rows], room[4 * rows : 13 * rows] if self._turns else None
+        k = room[13 * rows : (13 + call.count) * rows] if self._moves else self._distortion
         made = None
         if not left and (self._knows or not self._moves) and (self._knows or native.cameras == rows):
             made = self._made(call, kept, rows)
         elif is_one and not left:
-            made = single_native(model_of(self.base), intrinsics, k[0])
-        turned = rotation.view(rows, 3, 3) if self._turns else None
+            made = single_native(model_of(self.base), intrinsics, k)
         if is_one:
-            turned, k = None if turned is None else turned[0], k[0] if self._moves else k
+            turned = None if rotation is None else rotation.view(3, 3)
         else:
-            intrinsics = intrinsics.view(rows, 4)
-        return Drawn(base, intrinsics, k, self.size, turned, options, self.before, made, filled[0], filled[1])
+            turned = None if rotation is None else rotation.view(rows, 3, 3)
+            intrinsics, k = intrinsics.view(rows, 4), k.view(rows, call.count) if self._moves else k
+        factor, found = filled[:rows], filled[rows:]
+        return Drawn(base, intrinsics, k, self.size, turned, options, self.before, made, factor, found)
 
     def _tries(self, values: Mapping[str, Any], rows: int, call: structs.Draws) -> Native:
         """Make the lenses that compiled code chooses among, of a model whose domain it does not make by itself."""
@@ -243,15 +221,3 @@ class Start:
         k = room[13 * rows : (13 + count) * rows].view(rows, count)
         domain = partial(domain_for, model, k, False)
         return lenses_of(made.plan, k, lambda: Lenses.known(made.plan, model.optics, k, domain, made))
-
-
-class One(NamedTuple):
-    """A new camera as compiled code made it; what is not native belongs to whoever gets it, but for the room."""
-
-    native: Native
-    room: Tensor
-    intrinsics: Tensor
-    distortion: Tensor
-    rotation: Tensor | None
-    factor: float
-    filled: float

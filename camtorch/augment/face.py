@@ -132,10 +132,10 @@ class FaceNormalizer(SampleTransform):
         """
         sample = self._given(sample, fields)
         batch = self._batch(sample)
-        named, camera = batch.named, batch.camera
+        camera = batch.camera
         if not isinstance(sample.get("camera", camera), Camera):
             raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(sample['camera'])}")
-        kinds = {name: value for name, (_, value) in named.items()}
+        kinds = {name: value for name, (_, value) in batch.rows().items()}
         if listed := [n for n in ("head_pose", "rvec", "tvec", "face_center") if isinstance(kinds.get(n), list)]:
             raise TypeError(f"{self._name}: {', '.join(listed)} must be one tensor for all samples; got a list")
         if "head_pose" in kinds:
@@ -147,7 +147,7 @@ class FaceNormalizer(SampleTransform):
         centre = kinds.get("face_center", centre)
         moved = self._moved(sample, batch, self.change(camera, head, centre))
         scale = self.distance / centre.norm(dim=-1)
-        moved["scale"] = scale if batch.form.batched else scale.squeeze(0)
+        moved["scale"] = scale if batch.plan.batched else scale.squeeze(0)
         moved["source_camera"] = camera.clone()
         if "rotation" in sample:  # by earlier augmentations
             moved["source_rotation"] = sample["rotation"].clone()
@@ -169,7 +169,7 @@ class FaceNormalizer(SampleTransform):
         rotation = rotation if before is None else rotation @ before.mT
         rotation = rotation if rotation.ndim == 3 else rotation.unsqueeze(0)
         warp = Warp(source, normal, rotation.to(normal.intrinsics), **self.options)
-        moved = self._moved(sample, batch, Change(batch.form.count, [Part(None, warp, source)]).inverse())
+        moved = self._moved(sample, batch, Change(batch.plan.count, [Part(None, warp, source)]).inverse())
         del moved["rotation"]
         if before is not None:
             moved["rotation"] = moved.pop("source_rotation")

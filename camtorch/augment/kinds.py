@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import difflib
 import functools
 import math
@@ -14,17 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Change, Drawn
+from camtorch.augment.change import Change
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import may_look, pytree
-from camtorch.evaluate.known import are_free, are_numbers, known_false, known_true
+from camtorch.evaluate.known import known_false, known_true
 from camtorch.poses.rotations import are_rotations, check_rotation, is_right, rotation_matrix, rotation_vector
 from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians, warn
 from camtorch.values.dtypes import widen
-from camtorch.values.threads import thread_count
 from camtorch.warp import arrays
-from camtorch.warp.plan import Label, SampleCall, call_for
-from camtorch.warp.sampling import Options, Sampler
 
 Named = dict[str, tuple[str, Any]]
 """Maps a name to (kind, tensor or list of tensors)."""
@@ -94,7 +90,6 @@ def _rotation_vector(change: Change, rvec: Tensor, options: Mapping[str, float])
 
 
 _MANY = 16
-_MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
 
 
 def _positions(change: Change, points: Tensor, options: Mapping[str, float]) -> Tensor:
@@ -158,8 +153,8 @@ KINDS = {
     "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions, True),
     "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns)),
 }
-_TURNED = "points", "gaze", "directions", "tvec", "landmarks"
-_MATRICES = "head_pose", "pose", "rotation"
+TURNED = "points", "gaze", "directions", "tvec", "landmarks"
+MATRICES = "head_pose", "pose", "rotation"
 """Kinds whose columns turn."""
 BOXES = "boxes", *_PLACED
 CHECKED = (*BOXES, "rvec", "head_pose", "pose", "pitch_yaw")
@@ -267,6 +262,11 @@ def _is_angle(name: str) -> bool:
 def moves(kind: str, value: Tensor) -> Move:
     """Return the function that moves values of a kind."""
     return _positions if kind == "landmarks" and value.shape[-1] == 3 else KINDS[kind].move
+
+
+def moves_as_pixels(kind: str, value: Tensor) -> bool:
+    """Whether values of a kind are pixels."""
+    return moves(kind, value) is _pixels
 
 
 def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
@@ -422,80 +422,6 @@ def in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
         most = torch.finfo(dtype).max
         values = values.clamp(-most, most)
     return values.to(dtype)
-
-
-class Form:
-    """The form of samples: the fields that move, by name and kind, and the compiled call that moves them."""
-
-    def __init__(self, fields: list[tuple[str, str]], batched: bool, count: int):
-        self.fields, self.batched, self.count = fields, batched, count
-        self.settings: tuple[Any, ...] = ()  # with which `call` was made
-        self.names: list[str] = []  # of the fields that `call` moves
-        self.call: SampleCall | None = None
-        self.ready: Any = None  # of random cameras, which have looked whether
-        self.is_tried = False
-
-
-def together(change: Change, named: Named, form: Form, mask_fill: float) -> dict[str, tuple[Tensor, Tensor | None]]:
-    """Move fields by one compiled call, with their validity: images, pixels, and for a single sample boxes and rays.
-
-    The results have a batch dim, as `named` has, if samples of the form have one.
-    """
-    part, batched = change.parts[0], form.batched
-    if part.moves is None or part.rows is not None or change.gate is not None or not form.count:
-        return {}
-    if (between := part.between()) is None:
-        return {}
-    source, target, rotation = between
-    moved = part.moves if isinstance(part.moves, Drawn) and change.count == 1 else None
-    is_turn, options = moved is not None and moved.is_turn, part.moves.options
-    sizes = part.camera.size_for("Warp"), part.image_size
-    settings = sizes, source.dtype, options, mask_fill, moved is None, is_turn, thread_count()
-    if settings != form.settings:
-        hows = _ways(named, options, mask_fill, source.dtype if moved is not None else None, is_turn, change.count == 1)
-        values = [named[name][1] if batched else named[name][1][0] for name in hows]
-        form.call = call_for(sizes, source.dtype, options, values, [*hows.values()], batched) if hows else None
-        form.names, form.settings = list(hows), copy.deepcopy(settings)
-    most = max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9)
-    if form.call is None or most != form.count:
-        return {}
-    values = [named[name][1] if batched else named[name][1][0] for name in form.names]
-    made = form.call(source, target, rotation, values) if are_free(*values) else None
-    results: dict[str, tuple[Tensor, Tensor | None]] = {}
-    for name, value, result in zip(form.names, values, made or (), strict=bool(made)):
-        if result is not None:
-            results[name] = in_range(result[0], value.dtype), result[1]
-    return results
-
-
-def _ways(
-    named: Named, options: Options, mask_fill: float, dtype: torch.dtype | None, is_turn: bool, is_single: bool
-) -> dict[str, Sampler | Label]:
-    """Return how each field moves that one compiled call takes.
-
-    dtype: of labels of a single sample that turn, or None. is_turn: whether the rotation does not mirror.
-    """
-    mode, padding_mode, fill = options["mode"], options["padding_mode"], options["fill"]
-    hows: dict[str, Sampler | Label] = {}
-    for name, (found, value) in named.items():
-        if found in ("depth", "distance") or isinstance(value, list):  # these need the positions again
-            return {}
-        if value.ndim - 1 > KINDS[found].most_dims:  # frames
-            continue
-        if found == "image" and len(fill) in (1, value.shape[1]):
-            hows[name] = Sampler(mode, padding_mode, fill)
-        elif found == "mask":
-            hows[name] = Sampler("nearest", "zeros", (mask_fill,))
-        elif found not in BOXES and moves(found, value) is _pixels:
-            hows |= {name: "pixels"} if is_single or value.numel() < _MANY_PIXELS else {}
-        elif value.dtype == dtype and are_numbers(value):
-            if found == "boxes":
-                hows[name] = "boxes"
-            elif found in _TURNED and value.is_contiguous():
-                hows[name] = "rays"
-            elif found in _MATRICES and value.is_contiguous() and is_turn:
-                hows[name] = "columns" if found == "rotation" else "pose"
-    return hows
 
 
 def from_pitch_yaw(angles: Tensor) -> Tensor:

@@ -143,7 +143,10 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
         inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
         parts = [vars(part) for part in self.augmentation.modules()]
-        state = [(own.get("_revision"), str(own.get("options")), own.get("image_size")) for own in parts]
+        state = [
+            (getattr(own.get("_calls"), "revision", None), str(own.get("options")), own.get("image_size"))
+            for own in parts
+        ]
         memo, key = self._memos[len(values["apply"]) == 1], (type(camera), camera.image_size, *state)
         return memo.unless_learning(inputs, key, lambda: self.augmentation.change(camera, values))
 
@@ -225,7 +228,7 @@ class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
 
     def __getstate__(self) -> dict[str, Any]:
         # params of a graph could be neither copied nor pickled
-        return cast("dict[str, Any]", detached(super().__getstate__()))
+        return cast("dict[str, Any]", detached(self.__dict__.copy()))
 
     def __repr__(self) -> str:
         ranges = "".join(f"{name}={interval}, " for name, interval in self.augmentation.ranges.items())

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.known import are_free
+from camtorch.evaluate.door import is_eager
 from camtorch.values.arguments import as_number, shown, warn
 
 RangeLike = float | Sequence[float]
@@ -96,13 +96,16 @@ class Spans:
         self.total: int = len(self._ends)
         self.low, self.wide = np.array(self._ends, np.float64).reshape(-1, 2).T.copy()
 
-    def numbers(self, shares: Sequence[float]) -> list[float]:
-        """Return the values of one row, range by range."""
-        return [low + wide * share for (low, wide), share in zip(self._ends, shares, strict=True)]
-
-    def named(self, values: Sequence[float]) -> dict[str, list[Any]]:
-        """Return the values of one row, (1,) or (1, size), by their names."""
-        return {n: [*values[at]] if shape is None else [[*values[at]]] for n, at, shape in self._places}
+    def single(self, shares: Sequence[float]) -> dict[str, list[Any]]:
+        """Return the values of one row, (1,) or (1, size), at shares of their ranges."""
+        named: dict[str, list[Any]] = {}
+        for name, at, shape in self._places:
+            values = []
+            for i in range(at.start, at.stop):
+                low, wide = self._ends[i]
+                values.append(low + wide * shares[i])
+            named[name] = values if shape is None else [values]
+        return named
 
     def of(self, shares: Any) -> dict[str, Any]:
         """Return the values (rows,) or (rows, size) at shares (total,) of their ranges, arrays or tensors."""
@@ -127,31 +130,22 @@ def draw(
     Lists of one sample and arrays of several take less time than tensors, which come where the generator is on another
     device, or code is compiled.
     """
-    rows = min(count, 1) if same else count
-    gate, shares, spans = draw_shares(ranges, rows, p, generator, spans)
-    if are_free(shares):
-        if rows == count == 1:
-            applied = [p >= 1] if gate is None else gate.tolist()
-            return {"apply": applied, **spans.named(spans.numbers(shares.tolist()))}, spans
-        gate, shares = np.array([p >= 1] * rows, bool) if gate is None else gate.numpy(), shares.numpy()
-    elif gate is None:
-        gate = torch.full((rows,), p >= 1, device=shares.device)
-    values = {"apply": gate, **spans.of(shares)}
-    return (values if rows == count else {name: value[[0] * count] for name, value in values.items()}), spans
-
-
-def draw_shares(
-    ranges: Mapping[str, Range], rows: int, p: float, generator: torch.Generator | None, spans: Spans | None
-) -> tuple[Any, Any, Spans]:
-    """Return the gate (rows,), or None if there is no choice, a share of each range, and the ranges, ready.
-
-    The order is kornia's: the gate first.
-    """
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
+    rows = min(count, 1) if same else count
     if spans is None or spans.rows != rows or spans.ranges != [*ranges.items()]:
         spans = Spans(ranges, rows)
     device = "cpu" if generator is None else generator.device
+    # the order is kornia's: the gate first
     gate = torch.rand(rows, generator=generator, dtype=torch.float32, device=device) < p if 0 < p < 1 else None
+    applied: Any
     # in float64, so that what is drawn is what every precision sees
-    return gate, torch.rand(spans.total, generator=generator, dtype=torch.float64, device=device), spans
+    shares: Any = torch.rand(spans.total, generator=generator, dtype=torch.float64, device=device)
+    if is_eager(shares):
+        if rows == count == 1:
+            return {"apply": [p >= 1] if gate is None else gate.tolist(), **spans.single(shares.tolist())}, spans
+        applied, shares = np.array([p >= 1] * rows, bool) if gate is None else gate.numpy(), shares.numpy()
+    else:
+        applied = torch.full((rows,), p >= 1, device=device) if gate is None else gate
+    values = {"apply": applied, **spans.of(shares)}
+    return (values if rows == count else {name: value[[0] * count] for name, value in values.items()}), spans

@@ -11,12 +11,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from threading import get_ident
-from typing import Any, ClassVar, NamedTuple, ParamSpec, TypedDict, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from typing_extensions import Unpack
+from typing_extensions import Self, Unpack
 
 from camtorch.augment.change import Change, alone, as_one
 from camtorch.augment.clips import Clips
@@ -28,7 +28,6 @@ from camtorch.augment.kinds import (
     KEEP,
     KINDS,
     OWN,
-    Form,
     Named,
     as_tensor,
     check,
@@ -37,12 +36,13 @@ from camtorch.augment.kinds import (
     is_batch,
     kind_of,
     moves,
-    together,
     warn_of_numbers,
 )
 from camtorch.augment.landmarks import Mirroring, exchanged
+from camtorch.augment.plan import Batch, Plan
+from camtorch.augment.ranges import Spans
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.door import pytree
+from camtorch.evaluate.door import is_eager, pytree
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free, in_worker, is_unknown
 from camtorch.models import Pinhole
@@ -55,7 +55,6 @@ from camtorch.values.arguments import (
     as_mapping,
     as_number,
     check_devices,
-    hinting,
     no_camera,
 )
 from camtorch.values.dtypes import check_averaged
@@ -77,14 +76,6 @@ class Single(dict[str, Any]):
 
 class Frames(Single):
     """A single sample whose values may have leading dims, as those of clips have: all of them move by one change."""
-
-
-class Batch(NamedTuple):
-    """The fields of samples as a batch."""
-
-    named: Named
-    form: Form
-    camera: Camera
 
 
 class Unknown(Pinhole):
@@ -113,12 +104,21 @@ class KeepsCamera:
                     part.put(key, cast("Tensor", part._parameters.pop(key)).detach(), persistent=True)
         super().__setattr__(name, value)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in _OF_CALLS}
 
+class Calls:
+    """What calls leave in a transform. Copies and pickles begin anew: caches know a used one by its bytes."""
 
-_OF_CALLS = frozenset(("_revision", "_last", "_is_first", "_warned", "_spans"))
-"""What calls leave: a used object pickles to the bytes of an unused one, by which caches know it."""
+    last: Change | None = None
+    is_first: bool = False  # whether the last sample came without a rotation
+    warned: bool = False
+    spans: Spans | None = None  # the ranges, ready to draw from
+
+    def __init__(self) -> None:
+        self.revision = object()  # another one whenever a public attribute is set: results are kept by it
+        self.plans = Kept(16)  # of the last forms of samples
+
+    def __reduce__(self) -> tuple[type[Calls], tuple[()]]:
+        return Calls, ()
 
 
 def on_samples(method: Callable[P, R]) -> Callable[P, R]:
@@ -182,7 +182,19 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     other_words: ClassVar[Mapping[str, str]] = {}
     """Words that people try as keywords -> the keyword, for the hint of an error."""
-    _revision: object = None  # another one whenever a public attribute is set: results are kept by it
+
+    def __new__(cls, *args: Any, **options: Any) -> Self:
+        """Check the names of arguments, which Python would only call unexpected."""
+        known = _keywords(cls)  # type: ignore[arg-type]  # a class can be hashed
+        if word := next((word for word in options if word not in known), None):
+            raise TypeError(f"{cls.__name__}: unknown keyword {word!r}; {cls._meant(word)}. {LEFT}")
+        if args:
+            _, *own = (p for p in inspect.signature(cls.__init__).parameters.values() if p.kind is not p.VAR_KEYWORD)
+            most = sum(p.kind is p.POSITIONAL_OR_KEYWORD for p in own)
+            if len(args) > most and all(p.kind is not p.VAR_POSITIONAL for p in own):
+                got = f"{len(args)} were given. By name: {cls.__name__}({', '.join(f'{p.name}=...' for p in own)})"
+                raise TypeError(f"{cls.__name__}: at most {most} arguments may go without a name; {got}")
+        return super().__new__(cls)
 
     def __init__(
         self,
@@ -199,6 +211,7 @@ class SampleTransform(KeepsCamera, nn.Module):
     ):
         super().__init__()
         self._name = type(self).__name__
+        self._calls = Calls()
         self.camera = camera
         self.fields: dict[str, str] = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
         if wrong := {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}:
@@ -207,24 +220,6 @@ class SampleTransform(KeepsCamera, nn.Module):
         self.antialias = antialias
         self.mask_fill: float = as_number(mask_fill, "mask_fill", self._name)
         self.valid_mask: bool = as_flag(valid_mask, "valid_mask", self._name)
-        self._forms = Kept(16)
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        super().__init_subclass__(**options)
-        own: Any = vars(cls).get("__init__")
-        if (code := getattr(own, "__code__", None)) is None:
-            return
-        names = code.co_varnames[1 : code.co_argcount + code.co_kwonlyargcount]
-        hinted = hinting(f"By name: {cls.__name__}({', '.join(f'{name}=...' for name in names)})")(own)
-
-        @functools.wraps(own)
-        def checked(self: SampleTransform, *args: Any, **kwargs: Any) -> None:
-            for word in kwargs:
-                if word not in _keywords(cls):  # type: ignore[arg-type]  # a class can be hashed
-                    raise TypeError(f"{type(self).__name__}: unknown keyword {word!r}; {cls._meant(word)}. {LEFT}")
-            hinted(self, *args, **kwargs)
-
-        cls.__init__ = checked  # type: ignore[method-assign]
 
     @classmethod
     def _meant(cls, word: str) -> str:
@@ -237,13 +232,14 @@ class SampleTransform(KeepsCamera, nn.Module):
         return f"{meant} are {', '.join(known)}" + (f". {has} has it" if has else "")
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name[:1] != "_" and self.__dict__.get(name, self) is not value:
-            self.__dict__["_revision"] = object()
+        state = self.__dict__
+        if name[:1] != "_" and "_calls" in state and state.get(name, self) is not value:
+            self._calls.revision = object()
         super().__setattr__(name, value)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self.__dict__["_revision"] = object()
+        self._calls = Calls()  # which states before 0.5 lack
 
     @property
     def antialias(self) -> bool | None:
@@ -319,34 +315,25 @@ class SampleTransform(KeepsCamera, nn.Module):
     def _batch(
         self, sample: Sample, camera: Any = None, predicted: bool = False, kinds: Mapping[str, str] | None = None
     ) -> Batch:
-        """Return the fields that move, as a batch, their form, and the cameras.
+        """Return what moves of a sample; the plan of its form is kept.
 
-        The properties that samples of one form share are checked once. camera: instead of the sample's. predicted:
-        values may be bad. kinds: name -> kind, in addition to `fields`.
+        camera: instead of the sample's. predicted: values may be bad. kinds: name -> kind, in addition to `fields`.
         """
         camera = sample.get("camera") if camera is None else camera
         camera = self.camera if camera is None else camera
         fields = {**self.fields, **kinds} if kinds else self.fields
-        key = self._form_of(sample, camera, fields)
-        known = None if key is None else self._forms.entry((), key)
-        if known is None:
-            result = self._checked_batch(sample, camera, fields, predicted)
-            if key is None or result.camera is not camera:
-                return result
-            if all(kind in IMAGES or sample[n].dtype.is_floating_point for n, kind in result.form.fields):
-                self._forms((), key, lambda: result.form)
-            return result
-        form: Form = known[2]
-        if not predicted:
-            for name, found in form.fields:
-                if found in CHECKED:
-                    check_values(found, name, sample[name], self._name)
-        values = {n: (kind, sample[n] if form.batched else sample[n].unsqueeze(0)) for n, kind in form.fields}
-        return Batch(values, form, camera)
+        form = self._form_of(sample, camera, fields)
+        known = None if form is None else self._calls.plans.entry((), form)
+        if known is not None:
+            return Batch(known[2], sample, camera, predicted)
+        batch = self._checked_batch(sample, camera, fields, predicted)
+        if form is not None and batch.camera is camera and all(v is sample[n] for n, v in batch.values.items()):
+            self._calls.plans((), form, lambda: batch.plan)
+        return batch
 
     def _form_of(self, sample: Sample, camera: object, fields: Mapping[str, str]) -> tuple[Any, ...] | None:
-        """Return all that is checked of a sample but values; None if a field is no tensor or number, or of a Mixed."""
-        if not isinstance(camera, Camera) or camera.is_mixed or not are_free():
+        """Return all that a plan depends on; None if a field is no tensor or number, or of a `Mixed`."""
+        if not isinstance(camera, Camera) or camera.is_mixed or not is_eager():
             return None
         intrinsics, distortion = camera.tensors
         # each thread has calls of its own
@@ -359,7 +346,7 @@ class SampleTransform(KeepsCamera, nn.Module):
                 parts += name, type(value)
             else:
                 return None
-        return *parts, self._revision, *fields.items()
+        return *parts, self._calls.revision, *fields.items()
 
     def _checked_batch(self, sample: Sample, camera: Any, fields: Mapping[str, str], predicted: bool) -> Batch:
         if not (named := self._sorted(sample, fields)):
@@ -387,12 +374,11 @@ class SampleTransform(KeepsCamera, nn.Module):
                         if several and flags is not None:
                             flags = flags[i] if i < len(flags) else ()
                         warn_of_numbers(found, which, item, flags, size, self._name)
-            value = value if batched or several else value.unsqueeze(0)
-            named[name], own = (found, value), len(value)
+            own = len(value) if batched or several else 1
             count = own if count < 0 else count
             if own != count:
                 raise ValueError(f"{self._name}: {name} must be of {count} samples, as other fields; got {own}")
-        self._check_cameras(camera, count, named, batched)
+        self._check_cameras(camera, count, named)
         held = {name: v for name, (_, value) in named.items() for v in (value if isinstance(value, list) else [value])}
         check_devices(self._name, **held)
         device, camera = next((v.device for v in held.values()), torch.device("cpu")), alone(as_one(camera))
@@ -402,9 +388,14 @@ class SampleTransform(KeepsCamera, nn.Module):
             own, camera = camera, camera.each(lambda t: t.to(device))
             if own.intrinsics.is_cpu and not is_unknown(own.intrinsics):
                 remember_camera(camera, own)
-        return Batch(named, Form([(name, found) for name, (found, _) in named.items()], batched, count), camera)
+        flags = dict.fromkeys(
+            ["image_valid", *(f"{name}_valid" for name, (kind, _) in named.items() if kind in IMAGES)]
+        )
+        masks = [key for key in flags if sample.get(key) is not None or (self.valid_mask and key == "image_valid")]
+        plan = Plan({name: kind for name, (kind, _) in named.items()}, batched, count, masks)
+        return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, True)
 
-    def _check_cameras(self, camera: object, count: int, named: Named, batched: bool) -> None:
+    def _check_cameras(self, camera: object, count: int, named: Named) -> None:
         several = isinstance(camera, (list, tuple))
         cameras: list[Any] = list(camera) if several else [camera]  # type: ignore[call-overload]
         if not cameras:
@@ -423,7 +414,7 @@ class SampleTransform(KeepsCamera, nn.Module):
                     f"{self._name}: {name} must have no batch dims, or those of {count} samples; got {shape}"
                 )
             for field, value in images:
-                shapes = [v.shape for v in value] if isinstance(value, list) else [value.shape[not batched :]]
+                shapes = [v.shape for v in value] if isinstance(value, list) else [value.shape]
                 for shape in shapes[i : i + 1] if several and isinstance(value, list) else shapes:
                     self._check_size(field, tuple(shape), name, one.image_size)
         self._check_one_size("camera", {one.image_size for one in cameras})
@@ -473,34 +464,38 @@ class SampleTransform(KeepsCamera, nn.Module):
         first = change.parts[0]
         camera = first.camera if first.rows is None else change.source
         batch = self._batch(sample, camera, predicted, kinds)
-        if batch.form.count != change.count:
+        if batch.plan.count != change.count:
             raise ValueError(
-                f"{self._name}: the sample must be of {change.count}, as the change; got {batch.form.count}"
+                f"{self._name}: the sample must be of {change.count}, as the change; got {batch.plan.count}"
             )
         return self._moved(sample, batch, change)
 
     def _moved(self, sample: Sample, batch: Batch, change: Change) -> Sample:
-        moved, named, batched = dict(sample), batch.named, batch.form.batched
+        """Return the sample with all that moves by a change, what is valid of it, the rotation and the camera."""
+        plan, values, _, checked = batch
+        moved, batched = dict(sample), plan.batched
         options: dict[str, float] = {"mask_fill": self.mask_fill}
         if self.mirroring is not None:
             options["lateral"] = self.mirroring.lateral
-        alike = not self.valid_mask and sample.get("image_valid") is None
-        known = together(change, named, batch.form, self.mask_fill) if alike else {}
-        for name, (found, value) in named.items():
-            valid: Any
-            if name in known:
-                moved[name], valid = known[name]
+        together = {} if "image_valid" in plan.masks else plan.together(change, values, self.mask_fill)
+        for name, kind in plan.fields.items():
+            value, valid = values[name], cast("Any", None)
+            if name in together:
+                moved[name], valid = together[name]
             elif isinstance(value, list):
-                pairs = [self._one(change.row(i), found, v.unsqueeze(0), options) for i, v in enumerate(value)]
+                pairs = [self._one(change.row(i), kind, v.unsqueeze(0), options) for i, v in enumerate(value)]
                 moved[name] = [result.squeeze(0) for result, _ in pairs]
                 valid = [v.squeeze(0) for _, v in pairs if v is not None] or None
             else:
-                result, valid = self._one(change, found, value, options)
+                if not checked and kind in CHECKED:
+                    check_values(kind, name, value, self._name)
+                result, valid = self._one(change, kind, plan.rows(value), options)
                 moved[name] = result if batched else result.squeeze(0)
                 valid = valid if batched or valid is None else valid.squeeze(0)
             if valid is not None:
-                moved[f"{name}_valid"] = self._still(f"{name}_valid", valid, sample.get(f"{name}_valid"))
-        for key in dict.fromkeys(("image_valid", *(f"{n}_valid" for n, (k, _) in named.items() if k in IMAGES))):
+                flags = sample.get(f"{name}_valid")
+                moved[f"{name}_valid"] = valid if flags is None else self._still(f"{name}_valid", valid, flags)
+        for key in plan.masks:
             seen: Any = sample.get(key)
             if masked := getattr(seen, "ndim", 0) > 1 + batched:  # and no flag for each sample
                 seen = torch.as_tensor(seen) != 0
@@ -510,16 +505,16 @@ class SampleTransform(KeepsCamera, nn.Module):
                         f"{self._name}: {key} must be of {change.count} samples, as other fields; got {len(seen)}"
                     )
                 seen, _ = self._one(change, "mask", seen, {"mask_fill": 0.0})
-            if key == "image_valid" and self.valid_mask and any(found == "image" for found, _ in named.values()):
+            if key == "image_valid" and self.valid_mask and "image" in plan.fields.values():
                 whole = change.valid_mask()
                 seen = whole if not masked else seen & (whole if seen.ndim == 4 else whole[:, 0])
                 masked = True
             if masked:
                 moved[key] = seen.contiguous() if batched else seen[0].contiguous()
-        if "rotation" not in named:
+        if "rotation" not in plan.fields:
             moved["rotation"] = change.rotation.clone() if batched else change.single_rotation
         if self.mirroring is not None:
-            self._mirror(moved, named, change.mirrored, batched)
+            self._mirror(moved, batch.rows(), change.mirrored, batched)
         if not isinstance(change.parts[0].camera, Unknown):
             # the change keeps cameras of its own, to go back by
             target = change.several if batched else change.single
@@ -576,8 +571,6 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def _still(self, name: str, valid: Any, given: Any) -> Any:
         """Return the flags that come out, invalid if those given are; any number but zero is valid, as in COCO."""
-        if given is None:
-            return valid
         many = isinstance(valid, list)
         now, before = valid if many else [valid], [torch.as_tensor(b) != 0 for b in (given if many else [given])]
         if [b.shape for b in before] != [v.shape for v in now]:

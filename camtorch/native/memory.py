@@ -33,12 +33,18 @@ def tensor_on(
     block: mmap.mmap, dtype: torch.dtype, shape: tuple[int, ...], strides: tuple[int, ...], died: Callable[[], None]
 ) -> Tensor:
     """Return a tensor on the memory of a block; `died` is called when that memory is free."""
-    memory = (ctypes.c_char * len(block)).from_buffer(block)  # only the storage holds it
+    memory = _bytes(len(block)).from_buffer(block)  # only the storage holds it
     weakref.finalize(memory, died).atexit = False
     count = math.prod(shape) * dtype.itemsize  # a storage is saved as a whole, so it has no bytes beyond the tensor's
     storage = torch.frombuffer(memory, dtype=torch.uint8, count=count).untyped_storage()
     # not a view, as some operations refuse views
     return torch.empty(0, dtype=dtype, device="cpu").set_(storage, 0, shape, strides)
+
+
+@functools.lru_cache(maxsize=64)
+def _bytes(count: int) -> type[ctypes.Array[ctypes.c_char]]:
+    """Return the type of so many bytes, which ctypes makes anew each time."""
+    return ctypes.c_char * count
 
 
 @functools.lru_cache(maxsize=64)

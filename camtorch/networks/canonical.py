@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
-from camtorch.augment.sample import Batch, Sample, SampleTransform, on_samples
+from camtorch.augment.plan import Batch
+from camtorch.augment.sample import Sample, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited
 from camtorch.cameras.mixed import Mixed
@@ -97,7 +98,7 @@ class CanonicalCamera(SampleTransform):
         """
         sample = self._given(sample, fields)
         batch = self._batch(sample)
-        camera, count = batch.camera, batch.form.count
+        camera, count = batch.camera, batch.plan.count
         scale = self.scale(camera).expand(count)
         if self.scales == "depth":
             moved = self._scale_sample(sample, batch, scale)
@@ -105,7 +106,7 @@ class CanonicalCamera(SampleTransform):
             moved = self._resize_sample(sample, batch, self._change(camera, count))
             own = camera.clone()
             moved["source_camera"] = list(own) if isinstance(sample.get("camera"), (list, tuple)) else own
-        moved["scale"] = scale if batch.form.batched else scale.squeeze(0)
+        moved["scale"] = scale if batch.plan.batched else scale.squeeze(0)
         return moved
 
     @on_samples
@@ -121,14 +122,14 @@ class CanonicalCamera(SampleTransform):
         sample.pop("scale", None)
         if self.scales == "depth":
             batch = self._batch(sample, predicted=True)
-            return self._scale_sample(sample, batch, 1 / self.scale(batch.camera).expand(batch.form.count))
+            return self._scale_sample(sample, batch, 1 / self.scale(batch.camera).expand(batch.plan.count))
         if (source := sample.pop("source_camera", None)) is None:
             raise ValueError(f"{self._name}: source_camera must be in the sample, as forward() returned it; got none")
         source = as_one(source)
         change = self._change(source, len(source) if source.batch_shape else 1)
         target = change.target if source.batch_shape else alone(change.target)  # a batch dim would be the sample's
         batch = self._batch(sample, target, predicted=True)
-        change = change if change.count == batch.form.count else self._change(source, batch.form.count)
+        change = change if change.count == batch.plan.count else self._change(source, batch.plan.count)
         return self._resize_sample(sample, batch, change.inverse())
 
     if TYPE_CHECKING:
@@ -138,8 +139,8 @@ class CanonicalCamera(SampleTransform):
 
     def _scale_sample(self, sample: Sample, batch: Batch, scale: Tensor) -> Sample:
         """Return the sample with every length of the camera's frame multiplied by `scale` (B,)."""
-        moved, batched = dict(sample), batch.form.batched
-        for name, (found, value) in batch.named.items():
+        moved, batched = dict(sample), batch.plan.batched
+        for name, (found, value) in batch.rows().items():
             if isinstance(value, list):
                 moved[name] = [self._lengths(found, v, s, name) for v, s in zip(value, scale, strict=True)]
             else:

@@ -292,8 +292,9 @@ def remade(module: Made, **changes: Any) -> Made:
         state[name] = Kept()
     for name, tensor in tensors.items():
         if tensor.shape[-1]:
-            tensor = fixed(tensor)
-            if is_parameter(tensor):
+            is_one = type(tensor) is nn.Parameter  # as of most: what `fixed` would ask
+            tensor = tensor if is_one else fixed(tensor)
+            if is_one or is_parameter(tensor):
                 state["_parameters"][name] = state["_own"][name] = tensor
             else:
                 made.put(name, _widen(tensor))

@@ -10,8 +10,8 @@ import torch
 from cameras import slow_unless
 
 import camtorch as ct
-import camtorch.augment.kinds
 import camtorch.augment.numpy
+import camtorch.augment.plan
 from camtorch.evaluate.kept import Kept
 from camtorch.native.library import native_available
 
@@ -185,8 +185,8 @@ def test_odd_samples_as_step_by_step(form, name, monkeypatch):
     for _ in range(2):  # of which the second is ready
         torch.manual_seed(0)
         out = augment(sample, camera=camera)
-    monkeypatch.setattr(camtorch.augment.kinds, "call_for", lambda *given: None)
-    augment._forms = Kept(16)
+    monkeypatch.setattr(camtorch.augment.plan, "call_for", lambda *given: None)
+    augment._calls.plans = Kept(16)
     torch.manual_seed(0)
     expected = augment(sample, camera=camera)
     assert out.keys() == expected.keys()
@@ -229,7 +229,7 @@ def test_what_is_ready_heeds_changes(change, kind):
         sample = {**sample_for(torch.float32), **vectors, "pitch_yaw": torch.tensor([0.1, 0.2])}
         for _ in range(calls):
             augment(sample, camera=camera)
-        assert not calls or augment._forms.result.ready is not None
+        assert not calls or augment._calls.plans.result.calls.result[1] is not None  # a call of C serves it
         CHANGES[change](augment, camera)
         torch.manual_seed(1)
         outs.append(augment(sample, camera=camera))

@@ -1,0 +1,124 @@
+"""The plan of a form of samples: what moves, whether there is a dim B, and the one call of C that moves most of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from camtorch.augment.change import Change, Drawn
+from camtorch.augment.kinds import BOXES, KINDS, MATRICES, TURNED, in_range, moves_as_pixels
+from camtorch.cameras.camera import Camera
+from camtorch.evaluate.kept import Kept
+from camtorch.evaluate.known import are_free, are_numbers
+from camtorch.values.threads import thread_count
+from camtorch.warp.plan import Label, call_for
+from camtorch.warp.sampling import Options, Sampler
+
+_MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How samples of one form move. It is made once, and kept as long as the form and the transform stay the same."""
+
+    fields: Mapping[str, str]  # name -> kind of what moves, in the order of the sample
+    batched: bool
+    count: int
+    masks: Sequence[str]  # names of the masks of validity that come out: "image_valid" and so on
+    calls: Kept = field(default_factory=Kept)  # the names of the fields that one call moves, and the call
+
+    def rows(self, value: Any) -> Any:
+        """Return a value with a dim B; a list has one already."""
+        return value if self.batched or isinstance(value, list) else value.unsqueeze(0)
+
+    def together(
+        self, change: Change, values: Mapping[str, Any], mask_fill: float
+    ) -> dict[str, tuple[Tensor, Tensor | None]]:
+        """Move by one call of C: images, pixels, and for a single sample boxes and rays; also return their validity.
+
+        The other fields, and all of them where no call serves, are not in the result.
+        """
+        part = change.parts[0]
+        if part.moves is None or part.rows is not None or change.gate is not None or not self.count:
+            return {}
+        if (between := part.between()) is None:
+            return {}
+        source, target, rotation = between
+        most = max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9)
+        if most != self.count:
+            return {}
+        drawn, options = part.moves if isinstance(part.moves, Drawn) and change.count == 1 else None, part.moves.options
+        sizes, is_turn = (part.camera.size_for("Warp"), part.image_size), drawn is not None and drawn.is_turn
+        settings = sizes, source.dtype, *options.values(), mask_fill, drawn is None, is_turn, thread_count()
+
+        known = self.calls.entry((), settings)
+        if known is None:
+            labels = source.dtype if drawn is not None else None
+            ways = self._ways(values, options, mask_fill, labels, is_turn, change.count == 1)
+            chosen = [values[name] for name in ways]
+            call = call_for(sizes, source.dtype, options, chosen, [*ways.values()], self.batched) if ways else None
+            names = self.calls((), settings, lambda: (list(ways), call))[0]
+        else:
+            names, call = known[2]
+        given = [values[name] for name in names]
+        moved = call(source, target, rotation, given) if call is not None and are_free(*given) else None
+        results: dict[str, tuple[Tensor, Tensor | None]] = {}
+        for name, value, result in zip(names, given, moved or (), strict=bool(moved)):
+            if result is not None:
+                rows, valid = result
+                results[name] = rows if rows.dtype == value.dtype else in_range(rows, value.dtype), valid
+        return results
+
+    def _ways(
+        self,
+        values: Mapping[str, Any],
+        options: Options,
+        mask_fill: float,
+        dtype: torch.dtype | None,
+        is_turn: bool,
+        is_single: bool,
+    ) -> dict[str, Sampler | Label]:
+        """Return how each field moves that one call of C takes.
+
+        dtype: of labels of a single sample that turn, or None. is_turn: whether the rotation does not mirror.
+        """
+        mode, padding_mode, fill = options["mode"], options["padding_mode"], options["fill"]
+        ways: dict[str, Sampler | Label] = {}
+        for name, kind in self.fields.items():
+            value = values[name]
+            if kind in ("depth", "distance") or isinstance(value, list):  # these need the positions again
+                return {}
+            dims = value.ndim - self.batched
+            if dims > KINDS[kind].most_dims:  # frames
+                continue
+            if kind == "image" and len(fill) in (1, value.shape[-3]):
+                ways[name] = Sampler(mode, padding_mode, fill)
+            elif kind == "mask":
+                ways[name] = Sampler("nearest", "zeros", (mask_fill,))
+            elif kind not in BOXES and moves_as_pixels(kind, value):
+                ways |= {name: "pixels"} if is_single or value.numel() < _MANY_PIXELS else {}
+            elif value.dtype == dtype and are_numbers(value):
+                if kind == "boxes":
+                    ways[name] = "boxes"
+                elif kind in TURNED and value.is_contiguous():
+                    ways[name] = "rays"
+                elif kind in MATRICES and value.is_contiguous() and is_turn:
+                    ways[name] = "columns" if kind == "rotation" else "pose"
+        return ways
+
+
+class Batch(NamedTuple):
+    """Samples as they move: their plan, the values of its fields, and their cameras."""
+
+    plan: Plan
+    values: Mapping[str, Any]  # as they came, where these are tensors; without a dim B if the plan is not `batched`
+    camera: Camera
+    checked: bool  # whether the values were looked at, and not their form alone
+
+    def rows(self) -> dict[str, tuple[str, Any]]:
+        """Return name -> kind and value, with a dim B."""
+        return {name: (kind, self.plan.rows(self.values[name])) for name, kind in self.plan.fields.items()}
