@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -16,6 +15,7 @@ from typing_extensions import Self, TypeVar
 from camtorch.cameras.catalogue import Catalogue
 from camtorch.cameras.editing import Editable
 from camtorch.cameras.freezing import INTRINSICS, PREFIX, Freezable, all_frozen, learning_words, with_frozen
+from camtorch.cameras.kornia import to_kornia
 from camtorch.cameras.numbers import camera_of_fov, check_fast, checked_numbers, numbers_of_matrix, replaced
 from camtorch.convert.result import Conversion
 from camtorch.evaluate.kept import Kept
@@ -200,7 +200,9 @@ class Camera(Freezable, Editable):
         Raises:
             ValueError: If the file cannot be used, has several cameras, or one of another model than this class.
         """
-        return cast("Camera", importlib.import_module("camtorch.io.formats").load_camera(cls, path))
+        import camtorch  # the public names: files are made of cameras, so that readers stand above this package
+
+        return camtorch.io.load_camera(cls, path)
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Camera:
@@ -212,7 +214,9 @@ class Camera(Freezable, Editable):
         Raises:
             ValueError: If a key is missing, unknown or has a wrong value, or the model is another than this class.
         """
-        return cast("Camera", importlib.import_module("camtorch.io.camtorch_json").made_of(cls, d))
+        import camtorch  # as in `load`
+
+        return camtorch.io.made_of(cls, d)
 
     def to_kornia(self, extrinsics: Extrinsics | None = None) -> Any:
         """Return the camera as kornia has it; `ct.from_kornia` takes it back. Gradients reach this camera's tensors.
@@ -224,7 +228,7 @@ class Camera(Freezable, Editable):
         Raises:
             ValueError: If kornia has no such model, or one without a pose; without an image_size; with two batch dims.
         """
-        return importlib.import_module("camtorch.io.kornia").to_kornia(self, extrinsics)
+        return to_kornia(self, extrinsics)
 
     def replace(
         self,

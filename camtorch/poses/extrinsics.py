@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -146,7 +145,9 @@ class Extrinsics(BatchedModule):
         Raises:
             ValueError: If a key is missing, unknown or has a wrong value.
         """
-        return cast("Extrinsics", importlib.import_module("camtorch.io.camtorch_json").made_of(cls, d))
+        import camtorch  # as in `Camera.load`
+
+        return camtorch.io.made_of(cls, d)
 
     def inverse(self) -> Extrinsics:
         """Return the inverse pose: world from camera."""

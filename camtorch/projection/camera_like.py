@@ -29,6 +29,9 @@ class CameraLike(ModelSpec, BatchedModule):
         distortion: Tensor
 
         @property
+        def K(self) -> Tensor: ...  # noqa: N802
+
+        @property
         def fov(self) -> Tensor: ...
 
         def project(self, points: Numbers) -> tuple[Tensor, Tensor]: ...

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, ParamSpec, TypeVar, cast
@@ -265,7 +264,9 @@ class BatchedModule(GeometryModule):
         Raises:
             TypeError: If it is a `Mixed`, or a model without a key. ValueError: If a number is not finite.
         """
-        return cast("dict[str, Any]", importlib.import_module("camtorch.io.camtorch_json").dict_of(self))
+        import camtorch  # as in `Camera.load`
+
+        return camtorch.io.dict_of(cast("Any", self))
 
 
 Made = TypeVar("Made", bound=BatchedModule)
