@@ -171,18 +171,12 @@ class Start:
                 raise ValueError(
                     f"fov must be within the reach of a {base.key} lens of these coefficients; got {widest:g} degrees"
                 )
-            if left & structs.LEFT_BASE:
-                native.follow()
-            if left & structs.LEFT_SOURCE:
-                self.before.follow()
-            if left & structs.LEFT_ENDS:
-                ends = measured_once(lens_ends, remade(self.base, image_size=self.size), self._distortion)
-                self._call.ends = call.ends = self._keep(ends, *ends.shape[-2:])
             if left & structs.LEFT_LENS and tries is not None:
                 tries.follow()
             elif left & structs.LEFT_LENS:
                 self._follows = True
                 kept += self._limits(call, rows)
+            self._follow(left, call)
         if call.followed < rows and self._moves:
             call.made.limits2 = call.made.extent = None
         intrinsics, rotation = room[: 4 * rows], room[4 * rows : 13 * rows] if self._turns else None
@@ -199,6 +193,16 @@ class Start:
             intrinsics, k = intrinsics.view(rows, 4), k.view(rows, call.count) if self._moves else k
         factor, found = filled[:rows], filled[rows:]
         return Drawn(base, intrinsics, k, self.size, turned, options, self.before, made, factor, found)
+
+    def _follow(self, left: int, call: structs.Draws) -> None:
+        """Find what C has asked for of the cameras that it starts from."""
+        if left & structs.LEFT_BASE:
+            self._native.follow()
+        if left & structs.LEFT_SOURCE:
+            self.before.follow()
+        if left & structs.LEFT_ENDS:
+            ends = measured_once(lens_ends, remade(self.base, image_size=self.size), self._distortion)
+            self._call.ends = call.ends = self._keep(ends, *ends.shape[-2:])
 
     def _tries(self, values: Mapping[str, Any], rows: int, call: structs.Draws) -> Native:
         """Make the lenses that compiled code chooses among, of a model whose domain it does not make by itself."""

@@ -15,7 +15,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free, are_numbers
 from camtorch.values.threads import thread_count
-from camtorch.warp.plan import Label, call_for
+from camtorch.warp.samples import Label, call_for
 from camtorch.warp.sampling import Options, Sampler
 
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads

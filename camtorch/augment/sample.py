@@ -42,7 +42,7 @@ from camtorch.augment.landmarks import Mirroring, exchanged
 from camtorch.augment.plan import Batch, Plan
 from camtorch.augment.ranges import Spans
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.door import is_eager, pytree
+from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free, in_worker, is_unknown
 from camtorch.models import Pinhole
@@ -333,7 +333,7 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def _form_of(self, sample: Sample, camera: object, fields: Mapping[str, str]) -> tuple[Any, ...] | None:
         """Return all that a plan depends on; None if a field is no tensor or number, or of a `Mixed`."""
-        if not isinstance(camera, Camera) or camera.is_mixed or not is_eager():
+        if not isinstance(camera, Camera) or camera.is_mixed or not are_free():
             return None
         intrinsics, distortion = camera.tensors
         # each thread has calls of its own
