@@ -43,7 +43,8 @@ class Plan:
         The other fields, and all of them where no call serves, are not in the result.
         """
         part = change.parts[0]
-        if part.moves is None or part.rows is not None or change.gate is not None or not self.count:
+        moves = part.moves
+        if moves is None or part.rows is not None or change.gate is not None or not self.count:
             return {}
         if (between := part.between()) is None:
             return {}
@@ -51,14 +52,13 @@ class Plan:
         most = max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9)
         if most != self.count:
             return {}
-        drawn, options = part.moves if isinstance(part.moves, Drawn) and change.count == 1 else None, part.moves.options
-        sizes, is_turn = (part.camera.size_for("Warp"), part.image_size), drawn is not None and drawn.is_turn
-        settings = sizes, source.dtype, *options.values(), mask_fill, drawn is None, is_turn, thread_count()
-
+        options, is_single = moves.options, change.count == 1
+        turns = is_single and isinstance(moves, Drawn)  # labels of a single sample, by new cameras
+        sizes, is_turn = (part.camera.size_for("Warp"), part.image_size), turns and moves.is_turn
+        settings = sizes, source.dtype, *options.values(), mask_fill, turns, is_turn, thread_count()
         known = self.calls.entry((), settings)
         if known is None:
-            labels = source.dtype if drawn is not None else None
-            ways = self._ways(values, options, mask_fill, labels, is_turn, change.count == 1)
+            ways = self._ways(values, options, mask_fill, source.dtype if turns else None, is_turn, is_single)
             chosen = [values[name] for name in ways]
             call = call_for(sizes, source.dtype, options, chosen, [*ways.values()], self.batched) if ways else None
             names = self.calls((), settings, lambda: (list(ways), call))[0]

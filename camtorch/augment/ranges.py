@@ -98,14 +98,8 @@ class Spans:
 
     def single(self, shares: Sequence[float]) -> dict[str, list[Any]]:
         """Return the values of one row, (1,) or (1, size), at shares of their ranges."""
-        named: dict[str, list[Any]] = {}
-        for name, at, shape in self._places:
-            values = []
-            for i in range(at.start, at.stop):
-                low, wide = self._ends[i]
-                values.append(low + wide * shares[i])
-            named[name] = values if shape is None else [values]
-        return named
+        values = [low + wide * share for (low, wide), share in zip(self._ends, shares, strict=True)]
+        return {n: values[at] if shape is None else [values[at]] for n, at, shape in self._places}
 
     def of(self, shares: Any) -> dict[str, Any]:
         """Return the values (rows,) or (rows, size) at shares (total,) of their ranges, arrays or tensors."""

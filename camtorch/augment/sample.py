@@ -335,7 +335,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         """Return all that a plan depends on; None if a field is no tensor or number, or of a `Mixed`."""
         if not isinstance(camera, Camera) or camera.is_mixed or not are_free():
             return None
-        intrinsics, distortion = camera.tensors
+        intrinsics, distortion = camera.intrinsics, camera.distortion
         # each thread has calls of its own
         parts: list[Any] = [get_ident(), type(sample), type(camera), camera.image_size]
         parts += intrinsics.shape, intrinsics.dtype, intrinsics.device, distortion.shape
