@@ -1,4 +1,4 @@
-"""The names that `camtorch` shows, for type checkers alone: `camtorch/__init__.py` imports each at its first use."""
+"""The public names and where each is, for type checkers and for `__init__.py`, which imports it at its first use."""
 
 from camtorch import augment as augment
 from camtorch import data as data
@@ -24,7 +24,7 @@ from camtorch.io.kornia import from_kornia as from_kornia
 from camtorch.maps.formats import load_map as load_map
 from camtorch.maps.formats import save_map as save_map
 from camtorch.maps.lookup import LookupMap as LookupMap
-from camtorch.models import *  # noqa: F403 (the list is there)
+from camtorch.models import *  # noqa: F403 (its stub has the list)
 from camtorch.networks import losses as losses
 from camtorch.networks.canonical import CanonicalCamera as CanonicalCamera
 from camtorch.networks.head import CameraHead as CameraHead
@@ -42,3 +42,5 @@ from camtorch.warp.shutter import RollingShutter as RollingShutter
 from camtorch.warp.shutter import ShutterWarp as ShutterWarp
 from camtorch.warp.vignetting import vignetting as vignetting
 from camtorch.warp.warp import Warp as Warp
+
+__version__: str
