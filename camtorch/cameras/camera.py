@@ -398,6 +398,11 @@ class Camera(Freezable, Editable):
 
     _evaluate = evaluate_rows
 
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """All tensors that the camera learns, or could: what rooms ask, and users do not."""
+        return self.intrinsics, self.distortion
+
     def contains(self, pixels: Numbers) -> Tensor:
         """Whether pixels (..., 2) lie on the image, its outer pixel edges included; bool (...)."""
         return on_image(pixels, self.size_for("contains"), type(self).__name__)
@@ -567,7 +572,7 @@ class Camera(Freezable, Editable):
 
     def __dir__(self) -> list[str]:
         """Return the names that users call, without those that a model states or that modules are made of."""
-        inside = {*vars(ModelSpec), *vars(CameraLike), *dir(GeometryModule), "each", "memo_names", "tensor_names"}
+        inside = {*vars(ModelSpec), *vars(CameraLike), *dir(GeometryModule), "each", "memo_names", "tensor_names", "tensors"}
         inside -= {"distortion_names", "is_mixed", *dir(nn.Module)}
         names: list[str] = super().__dir__()  # type: ignore[no-untyped-call]
         return [n for n in names if n not in inside and (n[:1] != "_" or n[:2] == "__")]

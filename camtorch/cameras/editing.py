@@ -14,8 +14,8 @@ from camtorch.cameras.numbers import stack_numbers, unstack_numbers, warn_of_exc
 from camtorch.evaluate.known import are_numbers, known_false, known_true
 from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
-from camtorch.values.arguments import as_image_size, as_whole, hinting
-from camtorch.values.module import learning_as, remade
+from camtorch.values.arguments import as_known_size, as_whole, hinting
+from camtorch.values.module import remade
 
 CameraT = TypeVar("CameraT", bound=CameraLike)
 
@@ -31,18 +31,18 @@ def quarter_turns(image_size: tuple[int, int]) -> tuple[tuple[tuple[int, int, in
     )
 
 
-def edited_by(camera: CameraT, matrix: Sequence[Sequence[float]], size: Sequence[int]) -> CameraT:
-    """Return the camera of an image whose pixels all move by one map (2, 3); it learns if the camera does."""
-    new_size = as_image_size(size, type(camera).__name__)
-    if camera.is_mixed:
-        return cast("CameraT", cast("Any", camera).by_groups(lambda group: edited_by(group, matrix, size)))
-    return learning_as(edited(camera, matrix, new_size), camera)
+def edited(
+    camera: CameraT,
+    matrix: Tensor | Sequence[Sequence[float]],
+    image_size: tuple[int, int] | None,
+    learns: bool = False,
+) -> CameraT:
+    """Return the camera of an image whose pixels move by a `matrix` each, (*B, 2, 3): quarter turns, flips, scales.
 
-
-def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_size: tuple[int, int] | None) -> CameraT:
-    """Return the camera of an image whose pixels move by a `matrix` each, (*B, 2, 3): quarter turns, flips, scales."""
+    Without a graph it is fixed; with `learns` it learns if the camera does.
+    """
     if camera.is_mixed:
-        return cast("CameraT", cast("Any", camera).by_groups(lambda group: edited(group, matrix, image_size)))
+        return cast("CameraT", cast("Any", camera).by_groups(lambda group: edited(group, matrix, image_size, learns)))
     own, given = camera.intrinsics, [matrix] if isinstance(matrix, Tensor) else []
     xp: Any = np if are_numbers(own, camera.distortion, *given) else torch
     rows: Any = matrix
@@ -58,7 +58,7 @@ def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_si
         turns = np.any(turned) if xp is np else not known_true(matrix[..., 0, 1] == 0)
     distortion = _edit_distortion(camera, a - b, c + d, turned if turns else None)
     intrinsics = stack_numbers((*focal, *centre), own, xp)
-    return remade(camera, intrinsics=intrinsics, distortion=distortion, image_size=image_size)
+    return remade(camera, learns, intrinsics=intrinsics, distortion=distortion, image_size=image_size)
 
 
 def _edit_distortion(camera: CameraLike, across: Any, down: Any, on_side: Any) -> Tensor:
@@ -112,21 +112,22 @@ class Editable(CameraLike):
             ValueError: If the part has no pixel of the image.
         """
         top, left = (as_whole(v, name, "crop") for v, name in ((top, "top"), (left, "left")))
-        as_image_size((height, width), f"{type(self).__name__}.crop")
+        new_size = as_known_size((height, width), f"{type(self).__name__}.crop")
         size = self.image_size
         if size and (top >= size[0] or left >= size[1] or top + height <= 0 or left + width <= 0):
             raise ValueError(
                 f"{type(self).__name__}.crop: (top, left, height, width) must hold a pixel of the "
                 f"image (height, width) = {size}; got {(top, left, height, width)}"
             )
-        return edited_by(self, ((1, 0, -left), (0, 1, -top)), (height, width))
+        return edited(self, ((1, 0, -left), (0, 1, -top)), new_size, learns=True)
 
     def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
         """Return the camera of the image with that many more pixels on each side."""
         height, width = self.size_for("pad")
         sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
         left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
-        return edited_by(self, ((1, 0, left), (0, 1, top)), (height + top + bottom, width + left + right))
+        new_size = as_known_size((height + top + bottom, width + left + right), type(self).__name__)
+        return edited(self, ((1, 0, left), (0, 1, top)), new_size, learns=True)
 
     @hinting("It takes camera.resize(height, width), two numbers")
     def resize(self, height: int, width: int) -> Self:
@@ -135,20 +136,20 @@ class Editable(CameraLike):
         It warns if the new size is like the old one with height and width exchanged.
         """
         old_height, old_width = self.size_for("resize")
-        as_image_size((height, width), f"{type(self).__name__}.resize")
+        new_size = as_known_size((height, width), f"{type(self).__name__}.resize")
         warn_of_exchange((old_height, old_width), (height, width), f"{type(self).__name__}.resize")
         across, down = width / old_width, height / old_height
-        return edited_by(self, ((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), (height, width))
+        return edited(self, ((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), new_size, learns=True)
 
     def hflip(self) -> Self:
         """Return the camera that sees the scene mirrored left to right: its image is this one's, flipped."""
         height, width = self.size_for("hflip")
-        return edited_by(self, ((-1, 0, width - 1), (0, 1, 0)), (height, width))
+        return edited(self, ((-1, 0, width - 1), (0, 1, 0)), (height, width), learns=True)
 
     def vflip(self) -> Self:
         """Return the camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
         height, width = self.size_for("vflip")
-        return edited_by(self, ((1, 0, 0), (0, -1, height - 1)), (height, width))
+        return edited(self, ((1, 0, 0), (0, -1, height - 1)), (height, width), learns=True)
 
     def rot90(self, k: int = 1) -> Self:
         """Return the camera whose image is this one's, turned counterclockwise k times as by torch.rot90.
@@ -159,4 +160,4 @@ class Editable(CameraLike):
             ValueError: If a model that is not the same on its side, like a cylinder's, is turned by a quarter.
         """
         size, turns = self.size_for("rot90"), as_whole(k, "k", "rot90") % 4
-        return edited_by(self, quarter_turns(size)[turns], size[::-1] if turns % 2 else size)
+        return edited(self, quarter_turns(size)[turns], size[::-1] if turns % 2 else size, learns=True)

@@ -25,7 +25,7 @@ from camtorch.values.arguments import (
     hinting,
     shown,
 )
-from camtorch.values.module import BatchedModule, learning_as, remade, typed_as
+from camtorch.values.module import BatchedModule, remade, typed_as
 
 
 class Extrinsics(BatchedModule):
@@ -153,7 +153,7 @@ class Extrinsics(BatchedModule):
         """Return the inverse pose: world from camera."""
         # learnt rotation vectors may have any length
         rotation = -self.rotation.expand(*self.batch_shape, 3)
-        return learning_as(remade(self, rotation=rotation, translation=self.position), self)
+        return remade(self, True, rotation=rotation, translation=self.position)
 
     def compose(self, other: Extrinsics) -> Extrinsics:
         """Return the pose that applies `other` first, then this one: `a.compose(b)(p) == a(b(p))`."""

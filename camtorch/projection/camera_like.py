@@ -29,6 +29,9 @@ class CameraLike(ModelSpec, BatchedModule):
         distortion: Tensor
 
         @property
+        def tensors(self) -> tuple[Tensor, ...]: ...
+
+        @property
         def K(self) -> Tensor: ...  # noqa: N802
 
         @property
@@ -47,11 +50,6 @@ class CameraLike(ModelSpec, BatchedModule):
         ) -> tuple[Tensor, Tensor]: ...
 
     # what rooms ask of cameras, and users do not: neither `dir` nor the API pages list it
-
-    @property
-    def tensors(self) -> tuple[Tensor, ...]:
-        """All tensors that the camera learns, or could."""
-        return self.intrinsics, self.distortion
 
     @property
     def form(self) -> tuple[object, ...]:

@@ -277,30 +277,38 @@ def model_of(module: Made) -> type[Made]:
     return type_before_parametrizations(module) if "parametrizations" in module._modules else type(module)
 
 
-def remade(module: Made, **changes: Any) -> Made:
-    """Return the module with other attributes and tensors, which are `fixed`, but neither checked nor copied."""
+def remade(module: Made, learns: bool = False, /, **changes: Any) -> Made:
+    """Return the module with other attributes and tensors, neither checked nor copied.
+
+    New tensors without a graph are `fixed`; with `learns` they are Parameters that learn if those of the module do.
+    """
     model: Any = model_of(module)
     tensors = {name: changes.pop(name) if name in changes else getattr(module, name) for name in module.tensor_names}
+    made: Made
     if torch.compiler.is_compiling() and "image_size" in module.__dict__:
         # the compiler follows a constructor, but no way without one
         numbers = [fixed(tensor) for tensor in tensors.values() if tensor.shape[-1]]
-        return cast("Made", model(*numbers, image_size=changes.get("image_size", module.image_size)))
-    made: Made = model.__new__(model)
-    state = made.__dict__
-    state.update(module.__dict__, _is_full_backward_hook=None, **changes)
-    state.update(_containers())
-    for name in module.memo_names:
-        state[name] = Kept()
-    for name, tensor in tensors.items():
-        if tensor.shape[-1]:
-            is_one = type(tensor) is nn.Parameter  # as of most: what `fixed` would ask
-            tensor = tensor if is_one else fixed(tensor)
-            if is_one or is_parameter(tensor):
-                state["_parameters"][name] = state["_own"][name] = tensor
+        made = model(*numbers, image_size=changes.get("image_size", module.image_size))
+    else:
+        made = model.__new__(model)
+        state = made.__dict__
+        state.update(module.__dict__, _is_full_backward_hook=None, **changes)
+        state.update(_containers())
+        for name in module.memo_names:
+            state[name] = Kept()
+        for name, tensor in tensors.items():
+            if tensor.shape[-1]:
+                is_one = type(tensor) is nn.Parameter  # as of most: what `fixed` would ask
+                tensor = tensor if is_one else fixed(tensor)
+                if is_one or is_parameter(tensor):
+                    state["_parameters"][name] = state["_own"][name] = tensor
+                else:
+                    made.put(name, _widen(tensor))
             else:
-                made.put(name, _widen(tensor))
-        else:
-            made.put(name, tensor.detach() if tensor.requires_grad else tensor)
+                made.put(name, tensor.detach() if tensor.requires_grad else tensor)
+    for name in module.tensor_names if learns else ():
+        if isinstance(its := getattr(made, name), nn.Parameter):
+            its.requires_grad_(getattr(module, name).requires_grad)
     return made
 
 
@@ -316,15 +324,6 @@ def refused_index(module: BatchedModule, index: Any, error: Exception) -> Except
 def _widen(value: Tensor) -> Tensor:
     """Return the tensor in at least float32."""
     return value if value.dtype.itemsize >= 4 else value.to(torch.float32)
-
-
-def learning_as(made: Made, source: BatchedModule) -> Made:
-    """Return `made`, made of `source` without a graph, with Parameters that learn if those of `source` do."""
-    for name in source.tensor_names:
-        its = getattr(made, name)
-        if isinstance(its, nn.Parameter):
-            its.requires_grad_(getattr(source, name).requires_grad)
-    return made
 
 
 def fixed(tensor: Tensor) -> Tensor:
