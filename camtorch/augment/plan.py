@@ -54,7 +54,8 @@ class Plan:
             return {}
         options, is_single = moves.options, change.count == 1
         turns = is_single and isinstance(moves, Drawn)  # labels of a single sample, by new cameras
-        sizes, is_turn = (part.camera.size_for("Warp"), part.image_size), turns and moves.is_turn
+        is_turn = isinstance(moves, Drawn) and turns and moves.is_turn
+        sizes = part.camera.size_for("Warp"), part.image_size
         settings = sizes, source.dtype, *options.values(), mask_fill, turns, is_turn, thread_count()
         known = self.calls.entry((), settings)
         if known is None:

@@ -581,6 +581,7 @@ class Camera(Freezable, Editable):
             "tensor_names",
             "tensors",
         }
+        inside |= {"memo_names", "tensor_names"}
         inside -= {"distortion_names", "is_mixed", *dir(nn.Module)}
         names: list[str] = super().__dir__()  # type: ignore[no-untyped-call]
         return [n for n in names if n not in inside and (n[:1] != "_" or n[:2] == "__")]
