@@ -161,7 +161,7 @@ class Start:
         call.cameras = call.made.cameras = rows
         call.room, call.factors = room.data_ptr(), addressof(filled)
         call.filled = call.factors + 8 * rows
-        tries = self._tries(values, rows, call) if self._moves and not self._knows else None
+        tries = self._tries(values, rows, call) if rows and self._moves and not self._knows else None
         kept, run = [room], loaded().camtorch_draws
         if self._follows:  # some lenses have wanted limits
             kept += self._limits(call, rows)
