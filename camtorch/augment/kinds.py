@@ -21,6 +21,7 @@ from camtorch.poses.rotations import are_rotations, check_rotation, is_right, ro
 from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians, warn
 from camtorch.values.dtypes import widen
 from camtorch.warp import arrays
+from camtorch.warp.samples import Label
 
 Named = dict[str, tuple[str, Any]]
 """Maps a name to (kind, tensor or list of tensors)."""
@@ -38,9 +39,13 @@ IMAGES = ("image", "mask", "depth", "distance")
 Move = Callable[[Change, Tensor, Mapping[str, float]], Any]
 
 
+def _no_hint(name: str, value: Tensor, batched: bool) -> str:
+    return ""
+
+
 @dataclass(frozen=True)
 class Field:
-    """A kind of field."""
+    """A kind of field: all that is asked of it. C moves some kinds of a single sample, `way`, as `move` would."""
 
     dims: int  # the least number of dims of a single sample
     most_dims: int  # the most
@@ -48,6 +53,11 @@ class Field:
     shape: str  # in words, of a batch
     move: Move  # (change, batch, options) -> batch, or (batch, valid)
     decides: bool = False  # whether its number of dims distinguishes a batch from a sample
+    hint: Callable[[str, Tensor, bool], str] = _no_hint  # (name, value, batched) -> what to do about a wrong shape
+    check: Callable[[str, Tensor, str], None] | None = (
+        None  # (name, value, owner): raises if values are of no such kind
+    )
+    way: Label | None = None
 
 
 def _planes(move: Move) -> Move:
@@ -119,46 +129,162 @@ def _sided_boxes(kind: str, form: str) -> Field:
         low, high = corners.split(2, -1)
         return torch.cat((low + _PLACED[kind] * (high - low), high - low), -1)
 
+    def move(change: Change, boxes: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
+        return change.boxes(boxes, read, write)
+
+    def check_sides(name: str, value: Tensor, owner: str) -> None:
+        _check_form(kind, name, value, owner)
+        if not value.requires_grad and known_true((negative := (value[..., 2:] < 0).any(-1)).any()):
+            raise ValueError(
+                f"{owner}: {name} must be {KINDS[kind].shape}, with sides of 0 or more; got "
+                f"{value[negative][0].tolist()}. Boxes x1, y1, x2, y2 are of the kind 'boxes'"
+            )
+
     read = functools.partial(as_corners, kind)
-    return Field(
-        2, 2, (4,), f"(B, M, 4) pixels {form}", lambda change, boxes, _: change.boxes(boxes, read, write), True
+    return Field(2, 2, (4,), f"(B, M, 4) pixels {form}", move, True, _boxes_hint, check_sides)
+
+
+def _image_hint(name: str, value: Tensor, batched: bool) -> str:
+    if value.ndim == 5:
+        return f"The frames of clips go in as a batch, by {name}.flatten(0, 1)"
+    return f"A grey image goes in as {name}[None]" if value.ndim == 2 else ""
+
+
+def _rows_hint(name: str, value: Tensor, batched: bool) -> str:
+    """Return the hint for pixels or boxes without the dim of their number."""
+    if value.ndim - batched != 1:
+        return ""
+    shared = f", those that all samples share as {name}.expand(B, -1, -1)" if batched else ""
+    return f"A single one for each sample goes in as {name}[..., None, :]{shared}"
+
+
+def _keypoints_hint(name: str, value: Tensor, batched: bool) -> str:
+    if value.ndim and value.shape[-1] == 3:
+        return f"Pass visibility, [..., 2], as {name}_valid=..., a flag for each"
+    return _rows_hint(name, value, batched) if value.shape[-1:] == (2,) else ""
+
+
+def _boxes_hint(name: str, value: Tensor, batched: bool) -> str:
+    return _rows_hint(name, value, batched) if value.shape[-1:] == (4,) else ""
+
+
+def _column_hint(name: str, value: Tensor, batched: bool) -> str:
+    return f"OpenCV's column goes in as {name}[..., 0]" if value.shape[-2:] == (3, 1) else ""
+
+
+def _landmarks_hint(name: str, value: Tensor, batched: bool) -> str:
+    return _column_hint(name, value, batched) or (_rows_hint(name, value, batched) if value.shape[-1] in (2, 3) else "")
+
+
+def _rays_hint(name: str, value: Tensor, batched: bool) -> str:
+    if value.ndim and value.shape[-1] == 2:
+        return f"Pitch and yaw in radians go in as pitch_yaw, or with fields={{{name!r}: 'pitch_yaw'}}"
+    return _column_hint(name, value, batched)
+
+
+def _pose_hint(name: str, value: Tensor, batched: bool) -> str:
+    if value.shape[-1:] != (3,):
+        return ""
+    return (
+        "Rotations R (..., 3, 3) go in as torch.nn.functional.pad(R, (0, 1)), with zeros for the place; "
+        "R = ct.head_rotation(angles), of pitch, yaw and roll in radians. OpenCV's go in as rvec=..., tvec=..."
     )
 
 
-_DIRECTIONS = Field(
-    1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", lambda change, rays, _: change.rays(rays)
+def _check_form(kind: str, name: str, value: Tensor, owner: str) -> None:
+    form = getattr(getattr(value, "format", None), "value", None)  # of torchvision's BoundingBoxes
+    if form not in (None, "XYXY" if kind == "boxes" else kind.removeprefix("boxes_").upper()):
+        raise ValueError(
+            f"{owner}: {name} must be {KINDS[kind].shape}; got BoundingBoxes of the format {form}. Use "
+            "camtorch.augment.torchvision.Transform for them"
+        )
+
+
+def _check_corners(name: str, value: Tensor, owner: str) -> None:
+    _check_form("boxes", name, value, owner)
+    check_boxes(value, name, owner)
+
+
+def _check_rvec(name: str, value: Tensor, owner: str) -> None:
+    check_radians(value, name, owner)
+
+
+def _check_pose(name: str, value: Tensor, owner: str) -> None:
+    if not value.is_cpu or value.requires_grad:
+        return
+    rotations = value[..., :3, :3]
+    if value.ndim == 2 and is_right(rotations):
+        return
+    wrong = ~are_rotations(rotations) & torch.isfinite(rotations).flatten(-2).all(-1)
+    if known_false(~wrong):
+        check_rotation(rotations[wrong][:1], name, owner)
+
+
+def _check_pitch_yaw(name: str, value: Tensor, owner: str) -> None:
+    if not value.is_cpu or value.requires_grad:
+        return
+    # with room for the rounding of half precision
+    beyond = value.abs() > value.new_tensor([math.pi / 2, math.pi]) * 1.01
+    if known_false(~beyond):
+        pitch, yaw = value[beyond.any(-1)][0].tolist()
+        raise ValueError(
+            f"{owner}: {name} must be radians, pitch within pi / 2 and yaw within pi; got {pitch:.6g}, {yaw:.6g}. "
+            "Degrees are converted by torch.deg2rad() or math.radians()"
+        )
+
+
+def _rays(change: Change, rays: Tensor, options: Mapping[str, float]) -> Tensor:
+    return change.rays(rays)
+
+
+_DIRECTIONS = Field(1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", _rays, hint=_rays_hint, way="rays")
+_POSE = Field(
+    *(2, 2, (4,), "(B, 4, 4) or (B, 3, 4), camera from head", _pose, True),
+    hint=_pose_hint,
+    check=_check_pose,
+    way="pose",
 )
-_POSE = Field(2, 2, (4,), "(B, 4, 4) or (B, 3, 4), camera from head", _pose, True)
 _MASKS = "(B, C, H, W) or (B, H, W)"
 _DEPTHS = "(B, 1, H, W) or (B, H, W), along"
 _PITCH_YAW = "(B, *N, 2) pitch and yaw of a gaze in radians"
 KINDS = {
-    "image": Field(3, 3, (), "(B, C, H, W)", lambda change, images, _: change.images(images), True),
+    "image": Field(3, 3, (), "(B, C, H, W)", lambda change, images, _: change.images(images), True, _image_hint),
     "mask": Field(2, 3, (), _MASKS, _planes(lambda change, masks, given: change.labels(masks, given["mask_fill"]))),
     "depth": Field(2, 3, (), f"{_DEPTHS} z", _planes(lambda change, depth, _: change.depth(depth))),
     "distance": Field(2, 3, (), f"{_DEPTHS} the ray", _planes(lambda change, distance, _: change.distance(distance))),
-    "keypoints": Field(2, 3, (2,), "(B, N, 2) or (B, F, N, 2) pixels x, y", _pixels, True),
-    "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, True),
-    "boxes": Field(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", lambda change, boxes, _: change.boxes(boxes), True),
+    "keypoints": Field(
+        2, 3, (2,), "(B, N, 2) or (B, F, N, 2) pixels x, y", _pixels, True, _keypoints_hint, way="pixels"
+    ),
+    "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, True, way="pixels"),
+    "boxes": Field(
+        *(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", lambda change, boxes, _: change.boxes(boxes), True),
+        *(_boxes_hint, _check_corners, "boxes"),
+    ),
     "boxes_xywh": _sided_boxes("boxes_xywh", "x, y, width, height"),
     "boxes_cxcywh": _sided_boxes("boxes_cxcywh", "x and y of the centre, width, height"),
-    "landmarks": Field(2, 3, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True),
-    "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _positions),
+    "landmarks": Field(
+        *(2, 3, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True, _landmarks_hint)
+    ),
+    "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _positions, hint=_column_hint, way="rays"),
     "gaze": _DIRECTIONS,
     "directions": _DIRECTIONS,
-    "pitch_yaw": Field(1, _MANY, (2,), _PITCH_YAW, lambda c, angles, _: c.rays(angles, from_pitch_yaw, to_pitch_yaw)),
+    "pitch_yaw": Field(
+        *(1, _MANY, (2,), _PITCH_YAW, lambda change, angles, _: change.rays(angles, from_pitch_yaw, to_pitch_yaw)),
+        check=_check_pitch_yaw,
+    ),
     "head_pose": _POSE,
     "pose": _POSE,
-    "rvec": Field(1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector, True),
-    "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions, True),
-    "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", lambda c, turn, _: c.rays(turn, _columns, _columns)),
+    "rvec": Field(
+        1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector, True, _column_hint, _check_rvec
+    ),
+    "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions, True, _column_hint, way="rays"),
+    "rotation": Field(
+        *(2, 2, (3,), "(B, 3, 3), turned so far", lambda change, turn, _: change.rays(turn, _columns, _columns)),
+        hint=_column_hint,
+        way="columns",
+    ),
 }
-TURNED = "points", "gaze", "directions", "tvec", "landmarks"
-MATRICES = "head_pose", "pose", "rotation"
-"""Kinds whose columns turn."""
 BOXES = "boxes", *_PLACED
-CHECKED = (*BOXES, "rvec", "head_pose", "pose", "pitch_yaw")
-"""Kinds whose values are checked, in addition to their shape."""
 ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
 
@@ -259,14 +385,11 @@ def _is_angle(name: str) -> bool:
     return not _ANGLES.isdisjoint(name.lower().split("_"))
 
 
-def moves(kind: str, value: Tensor) -> Move:
-    """Return the function that moves values of a kind."""
-    return _positions if kind == "landmarks" and value.shape[-1] == 3 else KINDS[kind].move
-
-
-def moves_as_pixels(kind: str, value: Tensor) -> bool:
-    """Whether values of a kind are pixels."""
-    return moves(kind, value) is _pixels
+def field_of(kind: str, value: Tensor) -> Field:
+    """Return the field of values of a kind: `landmarks` are keypoints or points, by their last dim."""
+    if kind != "landmarks":
+        return KINDS[kind]
+    return KINDS["points" if value.shape[-1] == 3 else "keypoints"]
 
 
 def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
@@ -296,24 +419,7 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
     dims = value.ndim - batched
     if not field.dims <= dims <= field.most_dims or (field.last and value.shape[-1] not in field.last):
         what = field.shape if batched else field.shape.replace("(B, ", "(")
-        hint = _hint(name)
-        if kind in ("gaze", "directions") and value.ndim and value.shape[-1] == 2:
-            hint = f". Pitch and yaw in radians go in as pitch_yaw, or with fields={{{name!r}: 'pitch_yaw'}}"
-        if 3 in field.last and value.shape[-2:] == (3, 1):
-            hint = f". OpenCV's column goes in as {name}[..., 0]"
-        if kind in ("head_pose", "pose") and value.shape[-1:] == (3,):
-            hint = (
-                ". Rotations R (..., 3, 3) go in as torch.nn.functional.pad(R, (0, 1)), with zeros for the place; "
-                "R = ct.head_rotation(angles), of pitch, yaw and roll in radians. OpenCV's go in as rvec=..., tvec=..."
-            )
-        if kind in (*BOXES, "keypoints", "landmarks") and dims == 1 and value.shape[-1] in field.last:
-            hint = f". A single one for each sample goes in as {name}[..., None, :]"
-            hint += f", those that all samples share as {name}.expand(B, -1, -1)" if batched else ""
-        if kind == "image" and value.ndim in (2, 5):
-            clips = f"The frames of clips go in as a batch, by {name}.flatten(0, 1)"
-            hint = f". {clips}" if value.ndim == 5 else f". A grey image goes in as {name}[None]"
-        if kind == "keypoints" and value.ndim and value.shape[-1] == 3:
-            hint = f". Pass visibility, [..., 2], as {name}_valid=..., a flag for each"
+        hint = f". {hint}" if (hint := field.hint(name, value, batched)) else _hint(name)
         raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{hint}")
     if kind in ("head_pose", "pose") and value.shape[-2] not in (3, 4):
         raise ValueError(f"{owner}: {name} must be {field.shape}; got shape {tuple(value.shape)}")
@@ -321,38 +427,8 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
 
 def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
     """Raise a ValueError if plain labels are not in the form of their kind; NaN is accepted."""
-    if kind in BOXES:
-        form = getattr(getattr(value, "format", None), "value", None)  # of torchvision's BoundingBoxes
-        if form not in (None, "XYXY" if kind == "boxes" else kind.removeprefix("boxes_").upper()):
-            raise ValueError(
-                f"{owner}: {name} must be {KINDS[kind].shape}; got BoundingBoxes of the format {form}. Use "
-                "camtorch.augment.torchvision.Transform for them"
-            )
-        if kind == "boxes":
-            check_boxes(value, name, owner)
-        elif not value.requires_grad and known_true((negative := (value[..., 2:] < 0).any(-1)).any()):
-            raise ValueError(
-                f"{owner}: {name} must be {KINDS[kind].shape}, with sides of 0 or more; got "
-                f"{value[negative][0].tolist()}. Boxes x1, y1, x2, y2 are of the kind 'boxes'"
-            )
-    elif kind == "rvec":
-        check_radians(value, name, owner)
-    elif kind in ("head_pose", "pose") and value.is_cpu and not value.requires_grad:
-        rotations = value[..., :3, :3]
-        if value.ndim == 2 and is_right(rotations):
-            return
-        wrong = ~are_rotations(rotations) & torch.isfinite(rotations).flatten(-2).all(-1)
-        if known_false(~wrong):
-            check_rotation(rotations[wrong][:1], name, owner)
-    elif kind == "pitch_yaw" and value.is_cpu and not value.requires_grad:
-        # with room for the rounding of half precision
-        beyond = value.abs() > value.new_tensor([math.pi / 2, math.pi]) * 1.01
-        if known_false(~beyond):
-            pitch, yaw = value[beyond.any(-1)][0].tolist()
-            raise ValueError(
-                f"{owner}: {name} must be radians, pitch within pi / 2 and yaw within pi; got {pitch:.6g}, {yaw:.6g}. "
-                "Degrees are converted by torch.deg2rad() or math.radians()"
-            )
+    if (check := KINDS[kind].check) is not None:
+        check(name, value, owner)
 
 
 def warn_of_numbers(kind: str, name: str, value: Tensor, flags: Any, size: Sequence[int], owner: str) -> None:

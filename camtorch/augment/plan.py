@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.change import Change, Drawn
-from camtorch.augment.kinds import BOXES, KINDS, MATRICES, TURNED, in_range, moves_as_pixels
+from camtorch.augment.kinds import KINDS, field_of, in_range
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.known import are_free, are_numbers
@@ -100,15 +100,12 @@ class Plan:
                 ways[name] = Sampler(mode, padding_mode, fill)
             elif kind == "mask":
                 ways[name] = Sampler("nearest", "zeros", (mask_fill,))
-            elif kind not in BOXES and moves_as_pixels(kind, value):
-                ways |= {name: "pixels"} if is_single or value.numel() < _MANY_PIXELS else {}
-            elif value.dtype == dtype and are_numbers(value):
-                if kind == "boxes":
-                    ways[name] = "boxes"
-                elif kind in TURNED and value.is_contiguous():
-                    ways[name] = "rays"
-                elif kind in MATRICES and value.is_contiguous() and is_turn:
-                    ways[name] = "columns" if kind == "rotation" else "pose"
+            elif (way := field_of(kind, value).way) == "pixels":
+                ways |= {name: way} if is_single or value.numel() < _MANY_PIXELS else {}
+            elif way is None or value.dtype != dtype or not are_numbers(value):
+                continue
+            elif way == "boxes" or (value.is_contiguous() and (way == "rays" or is_turn)):
+                ways[name] = way
         return ways
 
 

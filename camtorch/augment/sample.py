@@ -22,7 +22,6 @@ from camtorch.augment.change import Change, alone, as_one
 from camtorch.augment.clips import Clips
 from camtorch.augment.elsewhere import remember_camera
 from camtorch.augment.kinds import (
-    CHECKED,
     FRONT_ENDS,
     IMAGES,
     KEEP,
@@ -32,10 +31,10 @@ from camtorch.augment.kinds import (
     as_tensor,
     check,
     check_values,
+    field_of,
     in_range,
     is_batch,
     kind_of,
-    moves,
     warn_of_numbers,
 )
 from camtorch.augment.landmarks import Mirroring, exchanged
@@ -487,7 +486,7 @@ class SampleTransform(KeepsCamera, nn.Module):
                 moved[name] = [result.squeeze(0) for result, _ in pairs]
                 valid = [v.squeeze(0) for _, v in pairs if v is not None] or None
             else:
-                if not checked and kind in CHECKED:
+                if not checked:
                     check_values(kind, name, value, self._name)
                 result, valid = self._one(change, kind, plan.rows(value), options)
                 moved[name] = result if batched else result.squeeze(0)
@@ -564,7 +563,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             moved = SampleTransform._one(frames, found, value.flatten(0, len(lead)), options)
             result, valid = (None if v is None else v.reshape(1, *lead, *v.shape[1:]) for v in moved)
             return cast("Tensor", result), valid
-        result = moves(found, value)(change, value, options)
+        result = field_of(found, value).move(change, value, options)
         result, valid = result if isinstance(result, tuple) else (result, None)
         # geometry is computed in float32 at least; what came in half precision goes out in it
         return in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid
