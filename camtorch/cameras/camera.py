@@ -280,20 +280,10 @@ class Camera(Freezable, Editable):
                     if not tensor.is_leaf:
                         instead = "Pass the parameters of the network or camera that it is made of to the optimizer"
                         raise TypeError(f"{owner}: {name} must be a Parameter; got a tensor of a graph. {instead}")
-                    steps[tensor] = min(lr / camera._effect(name, tensor), steps.get(tensor, math.inf))
+                    steps[tensor] = min(lr / _effect(camera, name, tensor), steps.get(tensor, math.inf))
         if not steps:
             raise ValueError(f"{owner}: camera must learn; got a fixed one. Call camera.requires_grad_() before")
         return [{"params": [tensor], "lr": step, "weight_decay": 0.0} for tensor, step in steps.items()]
-
-    def _effect(self, name: str, tensor: Tensor) -> float:
-        """Return by how many pixels one unit of a number of `tensor`, which `name` is made of, moves it at most."""
-        given = name == "intrinsics"
-        weights = torch.ones(4) if given else movement(self, self.distortion, self.intrinsics, lattice=33)
-        count = weights.shape[-1]
-        with torch.enable_grad():
-            pixels = (getattr(self, name) * weights.reshape(-1, count).amax(0).to(tensor)).reshape(-1, count).sum(0)
-            moved = [torch.autograd.grad(one, tensor, retain_graph=True)[0].abs().amax() for one in pixels]
-        return max(map(float, moved)) or 1e3  # small steps without an effect, like that of FOV's omega at 0
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -602,6 +592,17 @@ class Camera(Freezable, Editable):
         if self.image_size:
             parts.append(f"image_size={self.image_size}")
         return ", ".join([*parts, *learning_words(self)])
+
+
+def _effect(camera: Camera, name: str, tensor: Tensor) -> float:
+    """Return by how many pixels one unit of a number of `tensor`, which `name` is made of, moves it at most."""
+    given = name == "intrinsics"
+    weights = torch.ones(4) if given else movement(camera, camera.distortion, camera.intrinsics, lattice=33)
+    count = weights.shape[-1]
+    with torch.enable_grad():
+        pixels = (getattr(camera, name) * weights.reshape(-1, count).amax(0).to(tensor)).reshape(-1, count).sum(0)
+        moved = [torch.autograd.grad(one, tensor, retain_graph=True)[0].abs().amax() for one in pixels]
+    return max(map(float, moved)) or 1e3  # small steps without an effect, like that of FOV's omega at 0
 
 
 def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:

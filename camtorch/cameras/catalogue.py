@@ -65,7 +65,7 @@ class Catalogue(MutableMapping[str, KindT]):
                     f"{model.__name__}: {name} must be a @staticmethod of the coefficients k alone; got a "
                     f"{type(stated).__name__}"
                 )
-        model._model = register(model)
+        model.operator_name = register(model)
         model.always_defined = model.defined is ModelSpec.defined
         if "key" not in model.__dict__:
             model.key = ""

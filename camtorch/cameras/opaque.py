@@ -63,7 +63,7 @@ def opaque(shapes: Function) -> Callable[[Function], Function]:
             floats: list[float] = []
             for argument in arguments:
                 if isinstance(argument, Camera):
-                    kinds.append(f"camera {argument._model}")
+                    kinds.append(f"camera {argument.operator_name}")
                     tensors += [argument.intrinsics.detach(), argument.distortion.detach()]
                     sizes += argument.size_for(name)
                 elif isinstance(argument, Tensor):

@@ -58,7 +58,7 @@ class ModelSpec:
     """Ascending numbers of coefficients, of which a fit takes the least one that is good enough; by default the default
     one. If there are several, further coefficients that are zero change nothing."""
 
-    _model: ClassVar[str]  # the name by which operators find the class
+    operator_name: ClassVar[str] = ""  # by which operators find the class
 
     @staticmethod
     def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:

@@ -89,8 +89,8 @@ class Lenses:
     """The lenses' part of the struct; pointers that are not set are of values that are not known yet."""
 
     def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool = False):
-        self.plan, self._optics_of, self._k = plan, optics_of, k
-        self._slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
+        self.plan, self.optics_of, self.k = plan, optics_of, k
+        self.slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
         self.struct = struct = structs.Cameras()
         struct.hold(k)
         struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
@@ -113,22 +113,22 @@ class Lenses:
     def known(cls, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], made: Native) -> Lenses:
         """Return the lenses of cameras that compiled code made, with their parameters and domains."""
         lenses = cls.__new__(cls)
-        lenses.plan, lenses._optics_of, lenses._k = plan, optics_of, k
-        lenses._slow_domain, lenses.cameras, lenses.dtype = domain, len(k), k.dtype
+        lenses.plan, lenses.optics_of, lenses.k = plan, optics_of, k
+        lenses.slow_domain, lenses.cameras, lenses.dtype = domain, len(k), k.dtype
         lenses.struct = structs.Cameras.from_buffer_copy(made.struct)
         lenses.struct.hold(made.struct)
         return lenses
 
     def _optics(self) -> tuple[Chart, Lens]:
-        return self._optics_of(columns(self._k.double()))
+        return self.optics_of(columns(self.k.double()))
 
     @functools.cached_property
     def asked(self) -> structs.Domain:
         """The request for the domain, with optics in double precision."""
         made, plan = structs.Domain(), self.plan
         # they are in double precision if the model computes them
-        k = self._k if plan.places is not None else self._k.double()
-        parameters = plan.parameters_of(self._optics_of, k) if plan.parameters else k
+        k = self.k if plan.places is not None else self.k.double()
+        parameters = plan.parameters_of(self.optics_of, k) if plan.parameters else k
         made.parts, made.part_count = addressof(plan.parts), plan.count
         made.is_double, made.cameras, made.is_radial = self.dtype == torch.float64, self.cameras, plan.is_radial
         made.parameters, made.parameter_count = self._keep(parameters.double()), plan.parameters
@@ -163,7 +163,7 @@ class Lenses:
     def _add_domain(self, tables: bool) -> None:
         plan = self.plan
         if plan.is_chart:  # its end comes from a search
-            domain = self._slow_domain()
+            domain = self.slow_domain()
             self.struct.image_radius_sq = self._keep(domain.image_radius_sq)
             self.struct.safe_radius_sq = self._keep(domain.safe_radius_sq)
             return
@@ -171,7 +171,7 @@ class Lenses:
         has_table = tables and plan.has_factor  # made now, as pixels will follow
         start, step = self._new(len(names) + TABLE_WIDTH * has_table), self.cameras * self.dtype.itemsize
         wanted = {name: start + step * i for i, name in enumerate([*names, *["table"] * has_table])}
-        radii = None if plan.is_radial else plan.radii(lambda: self._optics()[0], structs.MOST_RADII, self._k)
+        radii = None if plan.is_radial else plan.radii(lambda: self._optics()[0], structs.MOST_RADII, self.k)
         self._ask(wanted if radii is None else wanted | {"radii": self._keep(radii)})
         for name, place in wanted.items():
             setattr(self.struct, name, place)
@@ -179,7 +179,7 @@ class Lenses:
     def radii_wanted(self) -> dict[str, Tensor]:
         """Return the radii on which lenses are followed, by their names in a request."""
         names = {"radii": structs.MOST_RADII, "even": structs.RADII, "coarse": structs.RADII // 2}
-        chart, like = self._optics()[0], self._k.double()
+        chart, like = self._optics()[0], self.k.double()
         return {name: self.plan.radii(lambda: chart, count, like) for name, count in names.items()}
 
     def inverse_table(self) -> int:
@@ -245,7 +245,7 @@ def lenses_of(plan: Plan, k: Tensor, make: Callable[[], Lenses]) -> Lenses:
 class Native:
     """Cameras (C,) of one model in the form of the compiled geometry."""
 
-    _make_lenses: Callable[[Native], Lenses]
+    make_lenses: Callable[[Native], Lenses]
 
     def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
         self.lenses, self.plan, self.struct = lenses, lenses.plan, structs.Cameras.from_buffer_copy(lenses.struct)
@@ -260,14 +260,14 @@ class Native:
         native = cls.__new__(cls)
         native.plan, native.dtype, native.parameters = base.plan, base.dtype, base.parameters
         native.struct, native.cameras, native.pointer = struct, struct.cameras, addressof(struct)
-        native._make_lenses = lenses
+        native.make_lenses = lenses
         struct.hold(room)
         return native
 
     @functools.cached_property
     def lenses(self) -> Lenses:
         """The lenses of the cameras, which other cameras may share."""
-        return self._make_lenses(self)
+        return self.make_lenses(self)
 
     def add_table(self) -> None:
         """Set the table from which the inverse of a radial factor starts."""

@@ -101,7 +101,7 @@ def single_native(model: type[CameraLike], intrinsics: Tensor, k: Tensor) -> Nat
 def domain_for(model: type[CameraLike], k: Tensor, learns: bool) -> Domain:
     """Return the domain of lenses (C, n) of a model, kept unless they learn."""
     # lenses that learn will not be used again
-    return Domain(model.optics, k) if learns else domain_of(model._model, k, model.optics)
+    return Domain(model.optics, k) if learns else domain_of(model.operator_name, k, model.optics)
 
 
 def _are_plain(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> bool:
@@ -183,7 +183,7 @@ class Traced(NamedTuple):
             k = torch.where(able, distortion.detach(), _ideal(model, intrinsics, distortion)[1])
             domain = Domain(model.optics, k)
             if domain.lens.stages:
-                domain.with_tables(*tables(model._model, k))
+                domain.with_tables(*tables(model.operator_name, k))
         if usable is not None:
             ideal = _ideal(model, intrinsics, distortion)
             intrinsics, distortion = (

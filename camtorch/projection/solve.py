@@ -150,15 +150,15 @@ class _Search:
     def planar(self, u: Tensor, v: Tensor) -> Planes2:
         """Run Newton's method; the few points that need many steps go on alone."""
         if self.domain.is_constant:
-            return self._newton(u, v, *self._start(u, v), _FIRST_STEPS + _LATE_STEPS)[:2]
-        a, b, active = self._newton(u, v, *self._start(u, v), _FIRST_STEPS)
+            return self.newton(u, v, *self._start(u, v), _FIRST_STEPS + _LATE_STEPS)[:2]
+        a, b, active = self.newton(u, v, *self._start(u, v), _FIRST_STEPS)
         (late,) = active.nonzero(as_tuple=True)
         if len(late):
             alone = _Search(self.domain, self.camera[late])
-            a[late], b[late], _ = alone._newton(u[late], v[late], a[late], b[late], _LATE_STEPS)
+            a[late], b[late], _ = alone.newton(u[late], v[late], a[late], b[late], _LATE_STEPS)
         return a, b
 
-    def _newton(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor, steps: int) -> Found:
+    def newton(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor, steps: int) -> Found:
         """Return points, and which of them would still move, after steps that come nearer and stay inside.
 
         Nearer in Deuflhard's sense means that the next step by the same Jacobian is shorter. If a lens stretches one

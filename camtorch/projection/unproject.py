@@ -155,9 +155,9 @@ def _formula(
         if domain.is_constant:
             found = _search_recorded(domain, (p, q), found)
         elif torch.compiler.is_compiling():
-            search_in_place(model._model, domain.k, p, q, *found)
+            search_in_place(model.operator_name, domain.k, p, q, *found)
         else:
-            a, b, solved = search_open(model._model, domain.k, p, q, *found)
+            a, b, solved = search_open(model.operator_name, domain.k, p, q, *found)
             found = Found(a, b, solved, found.possible)
         a, b, solved = found.a, found.b, found.solved
     else:
