@@ -49,7 +49,7 @@ class CameraLike(ModelSpec, BatchedModule):
             self, direction: Any, rows: Tensor, lead: Any, tensors: Any, cameras_of: Any = None
         ) -> tuple[Tensor, Tensor]: ...
 
-    # what rooms ask of cameras, and users do not: neither `dir` nor the API pages list it
+    # what other packages ask of cameras, and users do not: neither `dir` nor the API pages list it
 
     @property
     def form(self) -> tuple[object, ...]:
