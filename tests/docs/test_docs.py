@@ -2,6 +2,7 @@
 
 import doctest
 import functools
+import importlib
 import importlib.util
 import json
 import re
@@ -145,6 +146,15 @@ def test_every_public_name_has_a_place_in_the_reference():
     rooms = (ct, ct.augment, ct.data, ct.io, ct.lenses, ct.losses, ct.views)
     values = [getattr(room, name) for room in rooms for name in room.__all__]
     assert [v for v in values if callable(v) and f".{v.__name__}\n" not in reference + "\n"] == []
+
+
+def test_every_entry_of_the_reference_is_there():
+    pages = (page.read_text() for page in (ROOT / "docs" / "api").glob("*.md"))
+    entries = re.findall(r"^::: (camtorch\S*)\.(\w+)$", "\n".join(pages), re.M)
+    assert len(entries) > 100
+    for module, name in entries:
+        if module not in ("camtorch.augment.albumentations", "camtorch.augment.torchvision"):  # not always installed
+            assert hasattr(importlib.import_module(module), name), f"{module}.{name}"
 
 
 def test_every_format_has_a_row():
