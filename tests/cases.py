@@ -16,6 +16,7 @@ import camtorch as ct
 from camtorch import augment as A  # noqa: N812
 from camtorch import losses, views
 from camtorch.poses.rotations import rotation_matrix
+from camtorch.warp.sampling import MODES, PADDINGS
 
 SIZE = (48, 64)
 
@@ -106,7 +107,6 @@ def chain(*parts, **options):
     return moved(A.Compose(parts, camera=FISHEYE, **options))
 
 
-MODES, PADDINGS = ("nearest", "bilinear", "bicubic"), ("zeros", "border", "reflection")
 PROGRAMS = {
     f"Warp, {mode}, {padding}": warp(ct.Warp(FISHEYE, PINHOLE, TURN, mode=mode, padding_mode=padding, fill=9.0))
     for mode in MODES

@@ -15,6 +15,7 @@ import torch
 import camtorch as ct
 from camtorch.cli.main import main
 from camtorch.maps.formats import FORMATS
+from camtorch.warp.sampling import MODES, PADDINGS
 
 NOTES = [356.0, 356.0, 647.3, 404.8], [-0.0514, -0.0002, -0.0026, 0.0002]
 
@@ -400,8 +401,8 @@ def test_the_command_writes_a_map_and_measures_one(tmp_path, monkeypatch, capsys
     assert "80x60 from 320x200" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("mode", ["nearest", "bilinear", "bicubic"])
-@pytest.mark.parametrize("padding_mode", ["zeros", "border", "reflection"])
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("padding_mode", PADDINGS)
 def test_positions_beyond_every_float32_are_finite(mode, padding_mode):
     far = torch.tensor([1e300, -1e300, 1e30, -1e39, 3e9, torch.inf, -torch.inf, torch.nan], dtype=torch.float64)
     places = torch.stack(torch.meshgrid(far, torch.cat((far, torch.arange(9).double())), indexing="xy"), -1)

@@ -1,0 +1,74 @@
+"""What is added in one place has its entries in the others: a test for each kind of list says what lacks what."""
+
+import re
+from pathlib import Path
+
+import pytest
+from cameras import RANGES, STATED
+from rigs import MANIFEST, load
+
+import camtorch as ct
+from camtorch.maps import formats as maps
+from camtorch.viewer.viewer import models
+
+ROOT = Path(__file__).parents[2]
+
+
+def classes(base):
+    """The public classes of camtorch.augment that derive from a class."""
+    for kind in base.__subclasses__():
+        if kind.__module__.startswith("camtorch.augment.") and not kind.__name__.startswith("_"):
+            yield kind
+        yield from classes(kind)
+
+
+def test_every_table_has_every_model():
+    keys = {key for found in STATED.values() for key in found}
+    assert len(keys) > 20
+    kinds = {key: ct.MODELS[key] for key in keys & set(ct.MODELS.files)}
+    page = (ROOT / "docs" / "models.md").read_text()
+    tables = {
+        "the names in camtorch/models/__init__.py": {k for k in keys if ct.MODELS.files.get(k) == module_name(k)},
+        "RANGES in tests/cameras.py": {k for k in keys if k in RANGES or not getattr(kinds.get(k), "default_count", 0)},
+        "camtorch/viewer/presets.json": set(models()),
+        "docs/models.md": {k for k in keys if f"| `{k}` |" in page},
+    }
+    lacks = {name: sorted(keys - known) for name, known in tables.items() if keys - known}
+    assert lacks == {}, f"entries of models are missing: {lacks}"
+    assert set(ct.MODELS.files) <= keys, f"no file states the keys {sorted(set(ct.MODELS.files) - keys)}"
+
+
+def module_name(key):
+    return next(f"camtorch.models.{path.stem}" for path, keys in STATED.items() if key in keys)
+
+
+def test_every_file_of_a_model_states_a_key():
+    assert [path.name for path, keys in STATED.items() if not keys] == []
+
+
+def test_every_format_has_a_sample():
+    names = [*MANIFEST, "camtorch_0.2.0.json", "nuscenes/calibrated_sensor.json"]
+    without = {"ocamcalib"}  # tests/models/test_ocamcalib.py writes its files
+    assert {load(name).format for name in names} == set(ct.io.FORMATS) - without
+
+
+@pytest.mark.parametrize("format", maps.FORMATS)
+def test_every_format_of_maps_is_tried(format):
+    texts = [path.read_text() for path in (ROOT / "tests" / "maps").glob("test_*.py")]
+    assert any(f'"{format}"' in text for text in texts), f"tests/maps has no test of {format}"
+
+
+def test_every_format_of_labels_is_tried():
+    with pytest.raises(ValueError, match="format must be one of") as refused:
+        ct.data.read(".", format="?")
+    known = re.search(r"one of ([\w, ]+)", str(refused.value))[1].split(", ")
+    sets = re.search(r"^SETS = {(.*)}$", (ROOT / "tests" / "data" / "test_labels.py").read_text(), re.M)[1]
+    assert sorted(re.findall(r'"(\w+)":', sets)) == sorted(known)
+
+
+@pytest.mark.parametrize(("base", "file"), [("Edit", "test_edits.py"), ("Augmentation", "test_state.py")])
+def test_every_class_is_in_the_laws(base, file):
+    text = (ROOT / "tests" / "augment" / file).read_text()
+    names = {kind.__name__ for kind in classes(getattr(ct.augment, base))} - {"Edit", "CameraDrawer"}
+    assert len(names) > 5
+    assert sorted(name for name in names if not re.search(rf"A\.{name}\b", text)) == [], f"{file} lacks them"
