@@ -145,6 +145,17 @@ def tensor(values) -> torch.Tensor:
     return torch.tensor(filled(values, shape(values)), dtype=torch.float64)
 
 
+class Unproject(torch.nn.Module):
+    """A camera whose call is the other direction."""
+
+    def __init__(self, camera):
+        super().__init__()
+        self.camera = camera
+
+    def forward(self, pixels):
+        return self.camera.unproject(pixels)
+
+
 def make(key, intrinsics, distortion=None, **options):
     """A camera of any model, also of those that take no distortion."""
     has_some = distortion is not None and distortion.shape[-1] > 0

@@ -31,6 +31,12 @@ def load(name):
     return ct.load(FILES / name)
 
 
+def written(path, content):
+    """The path, after text or bytes were written there."""
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
 def assert_same(a, b, atol=0.0):
     """The same rig: cameras to the last bit, poses to the rounding of what their rotations are written as."""
     assert list(a.cameras) == list(b.cameras)

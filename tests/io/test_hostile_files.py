@@ -16,7 +16,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rigs import FAULTS, FILES, SAMPLES
+from rigs import FAULTS, FILES, SAMPLES, written
 
 import camtorch as ct
 
@@ -24,11 +24,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*4 coefficients and no fisheye_
 CAMERA = "1 PINHOLE 640 480 500 500 320 240\n"
 BINARY = struct.pack("<QIiQQ4d", 1, 1, 1, 4, 4, 1, 1, 1, 1)
 GIGANTIC = struct.pack("<Q", 1 << 60)
-
-
-def written(path, content):
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
 
 
 def loads_or_says_why(path):

@@ -2,7 +2,7 @@ import pickle
 
 import pytest
 import torch
-from rigs import FAULTS, FILES
+from rigs import FAULTS, FILES, written
 
 import camtorch as ct
 from camtorch.io import CameraFileError, opencv
@@ -13,11 +13,6 @@ K = [500.0, 0, 320, 0, 500, 240, 0, 0, 1]
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "camera.yml"
-
-
-def written(path, text):
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return path
 
 
 def test_old_header_other_names_and_what_is_not_asked_for_may_be_nan():

@@ -6,7 +6,7 @@ import re
 
 import pytest
 import torch
-from cameras import KEYS, each_kind, every_model, fan, make, one, pixel_lattice, slow_unless, spread
+from cameras import KEYS, Unproject, each_kind, every_model, fan, make, one, pixel_lattice, slow_unless, spread
 from torch import nn
 from torch.func import functional_call, jacfwd, jacrev, vmap
 
@@ -15,15 +15,6 @@ import camtorch as ct
 WITHOUT_JACFWD = ("brown_conrady", "f_theta_backward_sheared", "f_theta_sheared", "fisheye62", "fisheye624", "mei")
 WITHOUT_JACFWD += ("ocamcalib", "splined", "thin_prism_fisheye")
 both_directions = pytest.mark.parametrize("method", ["project", "unproject"])
-
-
-class Unproject(nn.Module):
-    def __init__(self, camera):
-        super().__init__()
-        self.camera = camera
-
-    def forward(self, pixels):
-        return self.camera.unproject(pixels)
 
 
 def module_and_input(key, method, dtype=torch.float64):

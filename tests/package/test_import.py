@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from cameras import Unproject
 
 import camtorch as ct
 
@@ -102,15 +103,7 @@ print(camera, *default_collate([camera, camera]).batch_shape)
 def test_exported_programs_load(tmp_path):
     camera = ct.FThetaBackward([300.0, 300, 320, 240], [0.01, 0.0]).requires_grad_(False)
 
-    class Rays(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.camera = camera
-
-        def forward(self, pixels):
-            return self.camera.unproject(pixels)
-
-    program = torch.export.export(Rays(), (torch.rand(10, 2),), strict=True)
+    program = torch.export.export(Unproject(camera), (torch.rand(10, 2),), strict=True)
     assert any("camtorch" in str(node.target) for node in program.graph.nodes)
     torch.export.save(program, tmp_path / "rays.pt2")
     code = "\nimport sys\nprint(torch.export.load(sys.argv[1]).module()(torch.full((10, 2), 9.0))[1].all())"
