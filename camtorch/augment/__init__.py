@@ -23,7 +23,7 @@ from camtorch.augment.edits import (
 )
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.face_model import face_points
-from camtorch.augment.kinds import from_pitch_yaw, to_pitch_yaw
+from camtorch.augment.fields import from_pitch_yaw, to_pitch_yaw
 from camtorch.augment.landmarks import LANDMARKS
 from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount

@@ -19,8 +19,8 @@ from albumentations.core.type_definitions import Targets
 
 from camtorch.augment import numpy as arrays
 from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.fields import KINDS, kind_of
 from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
-from camtorch.augment.kinds import KINDS, kind_of
 from camtorch.augment.sample import Unknown, detached
 from camtorch.cameras.camera import Camera
 

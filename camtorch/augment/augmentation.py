@@ -11,16 +11,16 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds, check_sizes
-from camtorch.augment.elsewhere import Elsewhere, remember_camera, twin_of
+from camtorch.augment.devices import Elsewhere, remember_camera, twin_of
+from camtorch.augment.fields import BOXES, FRONT_ENDS, as_corners
 from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.kinds import BOXES, FRONT_ENDS, as_corners
 from camtorch.augment.plan import Batch, Plan
 from camtorch.augment.ranges import Range, draw
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.door import may_look
-from camtorch.evaluate.known import are_known, are_numbers, known_false, known_true
+from camtorch.evaluate.tensors import are_known, are_numbers, known_false, known_true
 from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_part, as_whole, hinting, warn
 from camtorch.values.module import typed_as
 from camtorch.warp.warp import Warp

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited
 from camtorch.cameras.mixed import Mixed
-from camtorch.evaluate.known import are_numbers, known_false, known_true
+from camtorch.evaluate.tensors import are_numbers, known_false, known_true
 from camtorch.poses.rotations import is_right, turn
 from camtorch.projection.evaluation import rows_of
 from camtorch.projection.native_cameras import Native

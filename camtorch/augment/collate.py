@@ -12,7 +12,7 @@ from torch import Tensor
 
 from camtorch.augment.sending import stacked, within_message
 from camtorch.evaluate.door import COLLATE_FUNCTIONS, collate_by
-from camtorch.evaluate.known import in_worker
+from camtorch.evaluate.tensors import in_worker
 from camtorch.values.arguments import is_list
 
 

@@ -22,7 +22,7 @@ from torch.nn.utils.parametrize import type_before_parametrizations
 from camtorch import augment
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
-from camtorch.augment.kinds import OWN, is_text, kind_of
+from camtorch.augment.fields import OWN, is_text, kind_of
 from camtorch.augment.kornia_parts import BasicAugmentationBase, ParamItem
 from camtorch.augment.sample import KeepsCamera, Sample, Single, detached, on_samples
 from camtorch.cameras.camera import Camera

@@ -18,7 +18,7 @@ from camtorch.augment.landmarks import Mirroring, TableLike
 from camtorch.augment.ranges import Range, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited, quarter_turns
-from camtorch.evaluate.known import known_false, known_true
+from camtorch.evaluate.tensors import known_false, known_true
 from camtorch.values.arguments import as_known_size, as_whole
 from camtorch.warp.affine import AffineWarp, Map, Rows, after, as_tensor
 

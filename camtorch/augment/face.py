@@ -13,7 +13,7 @@ from typing_extensions import Unpack
 from camtorch.augment.change import Change, Part, alone
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.known import known_false
+from camtorch.evaluate.tensors import known_false
 from camtorch.poses.rotations import check_rotation, rotation_matrix
 from camtorch.values.arguments import as_known_size, as_number, no_camera, shown
 from camtorch.values.module import typed_as

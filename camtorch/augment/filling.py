@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.opaque import CameraNumbers, opaque
+from camtorch.cameras.operators import CameraNumbers, opaque
 from camtorch.native.structs import LOOKED_AT, SPREAD
 from camtorch.optics.radial_inverse import precise
 from camtorch.poses.rotations import rotation_matrix, rotation_vector

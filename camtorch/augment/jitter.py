@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.opaque import CameraNumbers, opaque
+from camtorch.cameras.operators import CameraNumbers, opaque
 from camtorch.lenses.drawing import covering
 from camtorch.native.structs import AMOUNTS, RIM
 from camtorch.rays.lattices import defined_or, movement, polar_rays, reach

@@ -30,7 +30,7 @@ from camtorch.augment.kornia_parts import transform_output_shape
 from camtorch.augment.sample import detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import known_false
+from camtorch.evaluate.tensors import known_false
 from camtorch.values.arguments import as_part, no_camera
 from camtorch.values.dtypes import narrow, widen
 from camtorch.warp.sampling import Mode

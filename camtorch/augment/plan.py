@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.change import Change, Drawn
-from camtorch.augment.kinds import KINDS, field_of, in_range
+from camtorch.augment.fields import KINDS, field_of, in_range
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import are_free, are_numbers
+from camtorch.evaluate.tensors import are_free, are_numbers
 from camtorch.values.threads import thread_count
 from camtorch.warp.samples import Label, call_for
 from camtorch.warp.sampling import Options, Sampler

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.opaque import fixed_camera
+from camtorch.cameras.operators import fixed_camera
 from camtorch.models import MODELS
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.known import are_free
+from camtorch.evaluate.tensors import are_free
 from camtorch.values.arguments import as_number, shown, warn
 
 RangeLike = float | Sequence[float]

@@ -20,8 +20,8 @@ from typing_extensions import Self, Unpack
 
 from camtorch.augment.change import Change, alone, as_one
 from camtorch.augment.clips import Clips
-from camtorch.augment.elsewhere import remember_camera
-from camtorch.augment.kinds import (
+from camtorch.augment.devices import remember_camera
+from camtorch.augment.fields import (
     FRONT_ENDS,
     IMAGES,
     KEEP,
@@ -43,7 +43,7 @@ from camtorch.augment.ranges import Spans
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import are_free, in_worker, is_unknown
+from camtorch.evaluate.tensors import are_free, in_worker, is_unknown
 from camtorch.models import Pinhole
 from camtorch.native.library import warn_if_missing
 from camtorch.values.arguments import (

@@ -22,7 +22,7 @@ from torch.multiprocessing import get_sharing_strategy
 from torch.multiprocessing.reductions import reduce_tensor
 
 from camtorch.evaluate.door import NO_TORCH_FUNCTION
-from camtorch.evaluate.known import in_worker
+from camtorch.evaluate.tensors import in_worker
 from camtorch.native.memory import LIMIT, tensor_on
 
 _SMALL = 1 << 16

@@ -15,16 +15,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.calibration import compiled as compiled_poses
+from camtorch.calibration import native_calls as compiled_poses
 from camtorch.calibration.observations import Observations
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.opaque import fixed_camera
+from camtorch.cameras.operators import fixed_camera
 from camtorch.convert.fitting import bounds
 from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
 from camtorch.least_squares.jacobians import sensor_jacobians
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, rounding_of
 from camtorch.poses.rotations import small_turn
-from camtorch.projection import compiled
+from camtorch.projection import native_calls
 from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.rows import CameraRows
 from camtorch.values.module import remade
@@ -467,7 +467,9 @@ def pixel_jacobians(camera: Camera, points: Tensor, learns: bool = True) -> tupl
     made = compiled_of([camera], points)
     if made is not None and (not learns or made[0][0].plan.places is not None):
         plan = made[0][0].plan
-        by_point, by_own = (t.nan_to_num(0.0, 0.0, 0.0) for t in compiled.project_jacobians(made[0][0], points, learns))
+        by_point, by_own = (
+            t.nan_to_num(0.0, 0.0, 0.0) for t in native_calls.project_jacobians(made[0][0], points, learns)
+        )
         if not learns or plan.places is None or plan.is_all:
             return by_point, by_own
         by_parameters = by_own.new_zeros(*by_own.shape[:-1], 4 + camera.distortion.shape[-1])

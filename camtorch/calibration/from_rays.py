@@ -10,7 +10,7 @@ from torch import Tensor
 
 from camtorch.calibration.calibrate import as_model
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.opaque import fixed_camera
+from camtorch.cameras.operators import fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.convert.result import Conversion
 from camtorch.models import UCM

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 
 from camtorch.calibration.batches import as_tensor, as_vectors, attached, learns, root_of, rows_of
 from camtorch.calibration.bundle import CameraObservations, Poses, adjust_poses
-from camtorch.calibration.compiled import Search, Solved, solve_poses
+from camtorch.calibration.native_calls import Search, Solved, solve_poses
 from camtorch.calibration.ransac import LEAST, consensus
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.cameras.camera import Camera

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch.calibration.compiled import can_search, from_rays
+from camtorch.calibration.native_calls import can_search, from_rays
 from camtorch.poses.rotations import nearest_rotation, small_turn
 
 _PAIRS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # where a symmetric matrix's entries are among its six numbers

@@ -14,7 +14,7 @@ from camtorch.calibration.observations import Observations
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.freezing import INTRINSICS
-from camtorch.cameras.opaque import fixed_camera
+from camtorch.cameras.operators import fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.models import UCM, KannalaBrandt
 from camtorch.rays.lattices import angles_from_axis

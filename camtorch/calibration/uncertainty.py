@@ -10,7 +10,7 @@ from torch import Tensor
 
 from camtorch.calibration.bundle import Adjusted, pixel_jacobians, robust
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.opaque import fixed_camera
+from camtorch.cameras.operators import fixed_camera
 from camtorch.least_squares.equations import Equations
 from camtorch.poses.rotations import skew_matrix
 from camtorch.values.arguments import Numbers, as_coordinates, as_values

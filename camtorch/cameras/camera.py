@@ -19,7 +19,7 @@ from camtorch.cameras.kornia import to_kornia
 from camtorch.cameras.numbers import camera_of_fov, check_fast, checked_numbers, numbers_of_matrix, replaced
 from camtorch.convert.result import Conversion
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import is_predicted, values_of
+from camtorch.evaluate.tensors import is_predicted, values_of
 from camtorch.optics.model_spec import ModelSpec
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.projection.camera_like import CameraLike

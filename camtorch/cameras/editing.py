@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from camtorch.cameras.numbers import stack_numbers, unstack_numbers, warn_of_exchange
-from camtorch.evaluate.known import are_numbers, known_false, known_true
+from camtorch.evaluate.tensors import are_numbers, known_false, known_true
 from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import as_known_size, as_whole, hinting

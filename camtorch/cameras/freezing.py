@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from camtorch.evaluate.known import may_write
+from camtorch.evaluate.tensors import may_write
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.module import is_parameter
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch.evaluate.known import are_free, is_kept, is_predicted, known_false, row_of, values_of
+from camtorch.evaluate.tensors import are_free, is_kept, is_predicted, known_false, row_of, values_of
 from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
 from camtorch.rays.lattices import AXES, focal_for

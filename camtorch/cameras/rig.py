@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.known import values_of
+from camtorch.evaluate.tensors import values_of
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.values.arguments import as_mapping, shown
 from camtorch.values.module import BatchedModule, UnsharedState

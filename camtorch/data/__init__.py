@@ -6,7 +6,7 @@ The result for a sample depends only on the sample, its key, a seed and the epoc
 from camtorch.data.columns import from_columns, to_columns
 from camtorch.data.detectors import from_dlib, from_insightface, from_mediapipe, from_ultralytics
 from camtorch.data.labels import Samples, read
-from camtorch.data.moving import MapBatches, MapSamples
+from camtorch.data.rows import MapBatches, MapSamples
 from camtorch.data.seeded import Key, Seeded, generator
 
 __all__ = [

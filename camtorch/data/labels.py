@@ -20,7 +20,7 @@ from PIL import Image
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from camtorch.augment.kinds import KINDS
+from camtorch.augment.fields import KINDS
 from camtorch.augment.landmarks import LANDMARKS, TableLike
 from camtorch.augment.sample import Sample
 from camtorch.cameras.camera import Camera

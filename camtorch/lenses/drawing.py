@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.cameras.opaque import opaque
+from camtorch.cameras.operators import opaque
 from camtorch.lenses.collection import entries
 from camtorch.models import KannalaBrandt
 from camtorch.projection.domain import Domain

@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.known import known_false, known_true
+from camtorch.evaluate.tensors import known_false, known_true
 from camtorch.values.arguments import Numbers, as_batch, as_number, as_real, is_list
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from camtorch.evaluate.known import known_false
+from camtorch.evaluate.tensors import known_false
 from camtorch.models._polynomial import OddPolynomial
 from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
 from camtorch.values.arguments import Numbers, as_batch, as_real

@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.known import known_false
+from camtorch.evaluate.tensors import known_false
 from camtorch.native.structs import ANGLE_OF_ALL_POWERS
 from camtorch.optics import AnglePerRadius, Chart, Inverted, Lens, RadiusPolynomial, Shear
 from camtorch.optics.radial import RadialFactor

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.freezing import INTRINSICS, learning_words
-from camtorch.evaluate.known import values_of
+from camtorch.evaluate.tensors import values_of
 from camtorch.native.structs import UNIFIED
 from camtorch.optics import Chart, Lens, Surface, Unified
 from camtorch.optics.surface import BEHIND

@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 
 from camtorch.native.build import LIBRARY, REASON, VARIANTS, checksum, switched_off
-from camtorch.native.known import wrong
+from camtorch.native.self_test import wrong
 from camtorch.native.structs import CHECKSUM, STRUCTS, Library
 from camtorch.native.structure import layout
 

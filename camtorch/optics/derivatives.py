@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.known import is_unknown
+from camtorch.evaluate.tensors import is_unknown
 
 
 def jacobian_of(part: Any, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

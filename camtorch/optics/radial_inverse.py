@@ -11,8 +11,8 @@ from torch import Tensor
 
 from camtorch.evaluate.export import as_index, is_portable_export, of_points, repeat, times
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import are_known
 from camtorch.evaluate.recorded import CLASSES
+from camtorch.evaluate.tensors import are_known
 from camtorch.native.structs import NODES
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.values.arguments import columns

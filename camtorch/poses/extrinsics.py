@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.known import known_false, values_of
+from camtorch.evaluate.tensors import known_false, values_of
 from camtorch.poses.rotations import are_rotations, check_rotation, rotate_planes, rotation_matrix, rotation_vector
 from camtorch.values.arguments import (
     Numbers,

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.known import are_free, as_own, known_false, known_true
+from camtorch.evaluate.tensors import are_free, as_own, known_false, known_true
 from camtorch.optics.special import angle_per_radius, cos_root, cosc_root, sinc_root
 from camtorch.values.arguments import Numbers, as_real, as_rows, as_values, check_devices
 

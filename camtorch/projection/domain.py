@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.elsewhere import sent
+from camtorch.evaluate.devices import sent
 from camtorch.evaluate.export import of_points, plus
 from camtorch.evaluate.kept import Kept
 from camtorch.native.structs import AZIMUTHS, MOST_RADII

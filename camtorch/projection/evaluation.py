@@ -15,7 +15,7 @@ from torch.nn.utils import parametrize
 from camtorch.evaluate.door import is_native, way_of
 from camtorch.evaluate.export import portable_export, with_values
 from camtorch.evaluate.kept import Kept, same
-from camtorch.evaluate.known import are_free
+from camtorch.evaluate.tensors import are_free
 from camtorch.native.library import warn_if_missing
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.rows import CameraRows, Direction, unusable

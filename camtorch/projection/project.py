@@ -9,7 +9,7 @@ from torch import Tensor
 
 from camtorch.evaluate.recorded import as_kept, positive, power_of_two, to_planes, without_keeping
 from camtorch.optics.charts import Planes3, floor_of
-from camtorch.projection import compiled
+from camtorch.projection import native_calls
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.native_cameras import Native
 from camtorch.projection.rows import CameraRows, Direction, Traced, replace, to_mask
@@ -68,7 +68,7 @@ def _formula(
 
 
 def _keeping(native: Native, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    return *compiled.project(native, points), (points,)
+    return *native_calls.project(native, points), (points,)
 
 
-PROJECT = Direction(_formula, compiled.project, _keeping, compiled.project_vjp, "points", 3)
+PROJECT = Direction(_formula, native_calls.project, _keeping, native_calls.project_vjp, "points", 3)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.elsewhere import on_cpu
+from camtorch.evaluate.devices import on_cpu
 from camtorch.evaluate.kept import note
-from camtorch.evaluate.known import known_true
+from camtorch.evaluate.tensors import known_true
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.domain import Domain, domain_of
 from camtorch.projection.native_cameras import Native, native_of

@@ -12,7 +12,7 @@ from camtorch.evaluate.recorded import order_of, positive, to_planes, without_ke
 from camtorch.optics.charts import Planes2
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
-from camtorch.projection import compiled
+from camtorch.projection import native_calls
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.native_cameras import Native
 from camtorch.projection.ops import search_in_place, search_open
@@ -181,12 +181,12 @@ def _formula(
 
 
 def _keeping(native: Native, pixels: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    rays, valid, solution = compiled.unproject(native, pixels, keeps=True)
+    rays, valid, solution = native_calls.unproject(native, pixels, keeps=True)
     # a copy, as the returned mask belongs to the caller
     return rays, valid, (valid.clone(), present(solution, "the solution"))
 
 
-UNPROJECT = Direction(_formula, compiled.unproject, _keeping, compiled.unproject_vjp, "pixels", 2)
+UNPROJECT = Direction(_formula, native_calls.unproject, _keeping, native_calls.unproject_vjp, "pixels", 2)
 
 
 def _search_recorded(domain: Domain, target: Planes2, found: Found) -> Found:

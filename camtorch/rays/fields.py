@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.known import is_unknown, known_false
+from camtorch.evaluate.tensors import is_unknown, known_false
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotate_planes, rotation_matrix
 from camtorch.projection.camera_like import CameraLike

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import known_false
+from camtorch.evaluate.tensors import known_false
 from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, TransverseCylindrical
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, skew_matrix

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from camtorch.evaluate.door import may_look
-from camtorch.evaluate.known import is_kept, is_predicted, known_false, row_of
+from camtorch.evaluate.tensors import is_kept, is_predicted, known_false, row_of
 
 Numbers: TypeAlias = Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]
 """Numbers as users pass them: a tensor, an array, a number, or lists of them."""

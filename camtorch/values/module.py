@@ -13,7 +13,7 @@ from typing_extensions import Self
 
 from camtorch.evaluate.door import outside_inference
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import is_kept
+from camtorch.evaluate.tensors import is_kept
 from camtorch.values.arguments import LEFT, shown
 
 P = ParamSpec("P")

@@ -12,9 +12,9 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.opaque import opaque
+from camtorch.cameras.operators import opaque
 from camtorch.evaluate.door import in_transform, keeps_graph
-from camtorch.evaluate.known import are_known, are_plain, is_unknown
+from camtorch.evaluate.tensors import are_known, are_plain, is_unknown
 from camtorch.native.sampler import maker
 from camtorch.native.structs import STEP
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.elsewhere import sent
-from camtorch.evaluate.known import is_predicted, known_true
+from camtorch.evaluate.devices import sent
+from camtorch.evaluate.tensors import is_predicted, known_true
 from camtorch.native.structs import EDGE_POINTS
 from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes
 from camtorch.warp.pair import CameraPair

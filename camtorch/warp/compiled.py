@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.opaque import CameraNumbers, opaque
+from camtorch.cameras.operators import CameraNumbers, opaque
 from camtorch.evaluate.kept import Kept
 from camtorch.native.sampler import layout
 from camtorch.values.arguments import broadcast_shapes

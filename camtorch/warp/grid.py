@@ -14,15 +14,15 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.devices import sent
 from camtorch.evaluate.door import in_jit_trace, may_look, set_aside
-from camtorch.evaluate.elsewhere import sent
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import are_free, are_plain, is_unknown
+from camtorch.evaluate.tensors import are_free, are_plain, is_unknown
 from camtorch.native.library import native_available
 from camtorch.native.sampler import classify
 from camtorch.native.structs import CELL_CUBIC, CELL_DOUBT, CELL_EMPTY, CELL_TODO, POSITIONS, STEP
 from camtorch.poses.rotations import turn
-from camtorch.projection.compiled import Between
+from camtorch.projection.native_calls import Between
 from camtorch.values.threads import on_one_thread
 from camtorch.warp.moving import between
 from camtorch.warp.panorama import goes_round, lengths, off_poles, within_turn

@@ -8,8 +8,8 @@ from torch import Tensor
 from camtorch.cameras.camera import Camera
 from camtorch.native.structs import ON_IMAGE, PIXELS
 from camtorch.poses.rotations import turn
-from camtorch.projection.compiled import Between
 from camtorch.projection.evaluation import compiled_of
+from camtorch.projection.native_calls import Between
 from camtorch.values.arguments import Numbers
 
 

@@ -11,7 +11,7 @@ from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import is_unknown
+from camtorch.evaluate.tensors import is_unknown
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
 from camtorch.warp.grid import Lattice, Sampling, locate

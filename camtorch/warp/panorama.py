@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.known import values_of
+from camtorch.evaluate.tensors import values_of
 from camtorch.models import Cylindrical, Equirectangular, LatLon, TransverseCylindrical
 from camtorch.values.module import remade
 

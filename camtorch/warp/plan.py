@@ -21,7 +21,7 @@ from camtorch.evaluate.door import (
     set_aside,
 )
 from camtorch.evaluate.export import with_values
-from camtorch.evaluate.known import is_unknown
+from camtorch.evaluate.tensors import is_unknown
 from camtorch.native.sampler import Call, maker
 from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, local_scale

@@ -10,7 +10,7 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.known import as_own, known_false, values_of
+from camtorch.evaluate.tensors import as_own, known_false, values_of
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.values.arguments import Numbers, as_batch, as_coordinates, as_number, as_real, shown
 from camtorch.warp.proxy import ProxyWarp, beside

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import are_plain, known_true
+from camtorch.evaluate.tensors import are_plain, known_true
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, turn
 from camtorch.rays.depth import as_depth, depth_scale

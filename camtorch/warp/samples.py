@@ -17,8 +17,8 @@ from camtorch.evaluate.kept import Kept
 from camtorch.native import memory, structs
 from camtorch.native.library import loaded
 from camtorch.native.sampler import describe, is_quick, maker, takes, tiles_of
-from camtorch.projection.compiled import Between, Lattices, run_and_follow
 from camtorch.projection.evaluation import compiled_of
+from camtorch.projection.native_calls import Between, Lattices, run_and_follow
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 from camtorch.warp.grid import FEWEST, MOST_KEPT, coarse, kept_probes

@@ -12,7 +12,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch.evaluate.door import converted, in_transform, is_eager, may_look
-from camtorch.evaluate.known import are_known, are_plain
+from camtorch.evaluate.tensors import are_known, are_plain
 from camtorch.native import sampler
 from camtorch.native.library import native_available, warn_if_missing
 from camtorch.values.arguments import as_flag, as_number, one_of, shown

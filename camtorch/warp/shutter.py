@@ -10,7 +10,7 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.known import as_own, known_false, values_of
+from camtorch.evaluate.tensors import as_own, known_false, values_of
 from camtorch.optics.special import cosc_root, sinc_root
 from camtorch.poses.rotations import as_rotation
 from camtorch.values.arguments import (

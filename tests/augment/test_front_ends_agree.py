@@ -11,7 +11,7 @@ from torchvision_stand_in import torchvision_of
 import camtorch as ct
 import camtorch.augment.numpy
 from camtorch.augment import BoxCrop, Compose, HorizontalFlip, Pad, RandomCamera, RandomMount, RandomResizedCrop
-from camtorch.augment.kinds import IMAGES, KINDS
+from camtorch.augment.fields import IMAGES, KINDS
 
 SIZE = 48, 64
 EDITS = {

@@ -13,9 +13,9 @@ from test_build import compiles
 
 import camtorch as ct
 from camtorch.native import build as building
-from camtorch.native import headers, known, structs
+from camtorch.native import headers, self_test, structs
 from camtorch.native.library import library, native_available
-from camtorch.projection import compiled
+from camtorch.projection import native_calls
 from camtorch.projection.evaluation import rows_of as camera_rows
 
 has_library = pytest.mark.skipif(not native_available(), reason="no compiled library is here")
@@ -52,14 +52,14 @@ def test_rows_of_other_cameras_and_shapes_are_errors_before_a_call():
     camera = ct.Pinhole([[1.0, 1, 0, 0]] * 2, image_size=(2, 2))
     native = camera_rows(camera, *(t.detach() for t in camera.tensors)).native
     with pytest.raises(ValueError, match="must be of 2 cameras; got those of 3"):
-        compiled.project(native, torch.ones(3, 4, 3))
+        native_calls.project(native, torch.ones(3, 4, 3))
     with pytest.raises(ValueError, match=re.escape("must be of (2, 4) rows; got (2, 5)")):
-        compiled.project_vjp(native, torch.ones(2, 4, 3), torch.ones(2, 2, 5), True, False)
+        native_calls.project_vjp(native, torch.ones(2, 4, 3), torch.ones(2, 2, 5), True, False)
 
 
 @has_library
 def test_each_call_has_a_known_answer():
-    asked = [name for name, *_ in known._answers(library())]
+    asked = [name for name, *_ in self_test._answers(library())]
     calls = headers.read().calls.items()
     assert sorted(asked) == sorted(name for name, (_, given) in calls if given not in ([], ["char*"]))
 

@@ -11,7 +11,7 @@ import camtorch as ct
 from camtorch.native.build import VARIANTS
 from camtorch.native.library import library, native_available
 from camtorch.optics import Equidistant, Lens, Stage
-from camtorch.projection import compiled as geometry
+from camtorch.projection import native_calls as geometry
 from camtorch.projection import native_cameras
 from camtorch.projection.project import PROJECT
 from camtorch.projection.rows import CameraRows

@@ -1,4 +1,4 @@
-"""New cameras of drawn numbers, by compiled code; `drawer.py` has the same formulas, recorded by torch."""
+"""New cameras of drawn numbers, by compiled code; `cameras.py` has the same formulas, recorded by torch."""
 
 from __future__ import annotations
 

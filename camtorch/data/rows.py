@@ -12,7 +12,7 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Part
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.kinds import IMAGES, KEEP, KINDS, kind_of
+from camtorch.augment.fields import IMAGES, KEEP, KINDS, kind_of
 from camtorch.augment.numpy import Transform
 from camtorch.augment.sample import Sample
 from camtorch.cameras.camera import Camera

@@ -16,7 +16,7 @@ from torch import Tensor
 from camtorch.augment.change import Change
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import may_look, pytree
-from camtorch.evaluate.known import known_false, known_true
+from camtorch.evaluate.tensors import known_false, known_true
 from camtorch.poses.rotations import are_rotations, check_rotation, is_right, rotation_matrix, rotation_vector
 from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians, warn
 from camtorch.values.dtypes import widen

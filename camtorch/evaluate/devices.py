@@ -11,7 +11,7 @@ from torch import Tensor
 
 from camtorch.evaluate.door import keeps_graph, outside_inference
 from camtorch.evaluate.kept import mark
-from camtorch.evaluate.known import is_unknown
+from camtorch.evaluate.tensors import is_unknown
 
 _ALIGNED = 16  # bytes: where the numbers of any dtype may begin
 _MOST = 64  # tensors

@@ -12,10 +12,10 @@ from torch import Tensor
 from camtorch.augment.change import Change, Moved, Part, as_is
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
+from camtorch.evaluate.devices import may_read, on_cpu, remember, sent
 from camtorch.evaluate.door import outside_inference
-from camtorch.evaluate.elsewhere import may_read, on_cpu, remember, sent
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import is_unknown
+from camtorch.evaluate.tensors import is_unknown
 from camtorch.native.library import native_available
 from camtorch.values.module import remade
 from camtorch.warp.affine import MirrorWarp

@@ -13,16 +13,16 @@ from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, FilledOptions
 from camtorch.augment.change import Drawn, Part
-from camtorch.augment.drawing import Start
-from camtorch.augment.elsewhere import twin_of
+from camtorch.augment.devices import twin_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.jitter import jittered
+from camtorch.augment.native_draws import Start
 from camtorch.augment.presets import PRESETS
 from camtorch.augment.ranges import Range, RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.catalogue import ELSEWHERE
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.known import are_numbers, known_false, with_derivatives_of
+from camtorch.evaluate.tensors import are_numbers, known_false, with_derivatives_of
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.models import MODELS, KannalaBrandt
 from camtorch.native.structs import AMOUNTS
