@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -27,6 +27,9 @@ from camtorch.warp.arrays import as_array, as_planes, as_tensor, can_share, plai
 
 _OWNER = "numpy.Transform"
 _VALID = "_valid"
+
+Way: TypeAlias = tuple[Callable[[Any], Sample], Callable[[Sample, Any], Any]]
+"""How a field is read, value -> tensors by name, and written, (moved sample, value as given) -> value."""
 
 
 class Transform(FrontEnd):
@@ -107,41 +110,26 @@ class Transform(FrontEnd):
         size = getattr(camera, "image_size", None)
         own, form = self.augmentation, _form_of(sample)
         options = {key: value for key, value in options.items() if value is not None}
-        if form is not None:
-            form = form, size, {**own.fields}, own.mirroring
-            layouts = self._forms((), form, lambda: self._layouts(sample, size))
-            if layouts is not None:
-                learns = not isinstance(camera, Camera) or any(t.requires_grad for t in camera.tensors)
-                return _moved_arrays(move, sample, options, layouts, learns)
-        entries = {name: self._entry(name, value, sample, size) for name, value in sample.items()}
-        inside = {key: tensor for tensors, _ in entries.values() for key, tensor in tensors.items()}
+        if form is None:
+            ways = self._ways(sample, size)
+        else:
+            ways = self._forms((), (form, size, {**own.fields}, own.mirroring), lambda: self._ways(sample, size))
+        tensors = {name: read(sample[name]) for name, (read, _) in ways.items()}
+        given = Single()
+        for own_tensors in tensors.values():
+            given.update(own_tensors)
         with torch.no_grad():
-            moved = move(Single(inside), **options)
-        result = {name: to(moved) for name, (tensors, to) in entries.items() if tensors.keys() <= moved.keys()}
-        for name in moved.keys() - inside.keys():
-            value = plain(moved[name]) if isinstance(moved[name], Tensor) else moved[name]
-            flat = name.endswith(_VALID) and self._kind(name, value, sample) in IMAGES
-            result[name] = value[0] if flat else value
+            moved = move(given, **options)
+        result = {
+            name: write(moved, sample[name])
+            for name, (_, write) in ways.items()
+            if tensors[name].keys() <= moved.keys()  # a face is moved back without its rotation
+        }
+        for name, value in moved.items():
+            if name not in given:
+                value = plain(value) if isinstance(value, Tensor) else value
+                result[name] = value[0] if name.endswith(_VALID) and value.ndim == 3 else value
         return result
-
-    def _layouts(self, sample: Sample, size: tuple[int, int] | None) -> list[tuple[str, int | None]] | None:
-        """Return fields with the dims of image arrays, 0 for labels, None for others; None if a field needs more."""
-        layouts: list[tuple[str, int | None]] = []
-        mirroring = self.augmentation.mirroring
-        for name, value in sample.items():
-            kind = None if name in OWN or value is None else self._kind(name, value, sample)
-            if kind is None and (mirroring is None or name not in mirroring.by_name):
-                layouts.append((name, None))
-            elif kind is None or name.endswith(_VALID) or not isinstance(value, np.ndarray) or not can_share(value):
-                return None
-            elif kind in IMAGES and name not in ALIASES:
-                as_planes(value, name, _OWNER, size)
-                layouts.append((name, value.ndim))
-            elif kind not in IMAGES and value.dtype.kind == "f":
-                layouts.append((name, 0))
-            else:
-                return None
-        return layouts
 
     def _kind(self, name: str, value: Any, sample: Mapping[str, Any]) -> str | None:
         """Return the kind of a field, or of the field whose validity it is; None if it is not moved."""
@@ -152,29 +140,58 @@ class Transform(FrontEnd):
             kind = kind if kind not in IMAGES or np.ndim(value) > 1 else None  # a flag for each sample
         return kind
 
-    def _entry(
-        self, name: str, value: Any, sample: Mapping[str, Any], size: tuple[int, int] | None
-    ) -> tuple[Sample, Callable[[Sample], Any]]:
-        """Return a field as tensors, and a function that restores its layout."""
+    def _ways(self, sample: Mapping[str, Any], size: tuple[int, int] | None) -> dict[str, Way]:
+        """Return how each field is read and written, which its form alone decides."""
+        return {name: self._way(name, value, sample, size) for name, value in sample.items()}
+
+    def _way(self, name: str, value: Any, sample: Mapping[str, Any], size: tuple[int, int] | None) -> Way:
         kind = None if name in OWN or value is None else self._kind(name, value, sample)
         mirroring = self.augmentation.mirroring
         if kind is None and (mirroring is None or name not in mirroring.by_name):
-            return {name: value}, lambda moved: moved[name]
+            return lambda given: {name: given}, lambda moved, given: moved[name]
+        flags, many = name.endswith(_VALID), isinstance(value, (list, tuple))
+        # most arrays are read as they are, without questions for the next samples of the form
+        is_shared = isinstance(value, np.ndarray) and not flags and value.flags.writeable and can_share(value)
         if kind not in IMAGES:
-            value = _numbers(value, name, kind)
-            tensor = as_tensor(value, name, _OWNER)
-            return {name: tensor}, lambda moved: plain(moved[name]).astype(value.dtype, copy=False)
-        many = isinstance(value, (list, tuple))
+
+            def numbers(given: Any) -> Sample:
+                return {name: as_tensor(_numbers(given, name, kind), name, _OWNER)}
+
+            def as_given(moved: Sample, given: Any) -> Any:
+                return plain(moved[name]).astype(_numbers(given, name, kind).dtype, copy=False)
+
+            if kind is not None and is_shared and value.dtype.kind == "f":
+                return lambda given: {name: torch.from_numpy(given)}, lambda moved, given: moved[name].numpy()
+            return numbers, as_given
         if not many and name not in ALIASES:
-            value = np.asarray(value, bool) if name.endswith(_VALID) else value
-            return {name: as_planes(value, name, _OWNER, size)}, lambda moved: as_array(moved[name], value)
+
+            def planes(given: Any) -> Sample:
+                return {name: as_planes(np.asarray(given, bool) if flags else given, name, _OWNER, size)}
+
+            def image(moved: Sample, given: Any) -> Any:
+                return as_array(moved[name], np.asarray(given, bool) if flags else given)
+
+            planes(value)  # raises if it is none
+            if not is_shared:
+                return planes, image
+            if value.ndim == 2:
+                return lambda given: {name: torch.from_numpy(given)[None]}, lambda moved, given: moved[name].numpy()[0]
+            return lambda given: {name: torch.from_numpy(given).permute(2, 0, 1)}, image
         key = f"{kind}_{name}"  # the augmentation knows a name that begins with a kind
         if not many and not len(value):  # only the size changes; an image has no channels
-            empty = torch.from_numpy(value.reshape(value.shape[:3]))
-            return {key: empty}, lambda moved: np.empty((*moved[key].shape, *value.shape[3:]), value.dtype)
-        tensors = {f"{key}[{i}]": as_planes(one, f"{name}[{i}]", _OWNER, size) for i, one in enumerate(value)}
-        to = list if many else np.stack
-        return tensors, lambda moved: to([as_array(moved[k], one) for k, one in zip(tensors, value, strict=True)])
+            return (
+                lambda given: {key: torch.from_numpy(given.reshape(given.shape[:3]))},
+                lambda moved, given: np.empty((*moved[key].shape, *given.shape[3:]), given.dtype),
+            )
+
+        def each(given: Any) -> Sample:
+            return {f"{key}[{i}]": as_planes(one, f"{name}[{i}]", _OWNER, size) for i, one in enumerate(given)}
+
+        def joined(moved: Sample, given: Any) -> Any:
+            images = [as_array(moved[f"{key}[{i}]"], one) for i, one in enumerate(given)]
+            return images if many else np.stack(images)
+
+        return each, joined
 
 
 def _form_of(sample: Sample) -> tuple[Any, ...] | None:
@@ -190,36 +207,6 @@ def _form_of(sample: Sample) -> tuple[Any, ...] | None:
         else:
             return None
     return tuple(parts)
-
-
-def _moved_arrays(
-    move: Callable[..., Sample], sample: Sample, options: Sample, layouts: list[tuple[str, int | None]], learns: bool
-) -> Sample:
-    """Move a sample whose arrays torch can read without a copy; see `Transform._layouts`.
-
-    learns: whether the camera may require grad; the sample is then moved without gradients.
-    """
-    given = Single()
-    for name, dims in layouts:
-        value = sample[name]
-        if dims is not None:
-            value = torch.from_numpy(value)
-            value = value.permute(2, 0, 1) if dims == 3 else value[None] if dims == 2 else value
-        given[name] = value
-    with torch.no_grad() if learns else contextlib.nullcontext():
-        moved = move(given, **options)
-    result: Sample = {}
-    for name, dims in layouts:
-        if name in moved:
-            value = moved[name] if dims is None else moved[name].numpy()
-            result[name] = (
-                np.ascontiguousarray(value.transpose(1, 2, 0)) if dims == 3 else value[0] if dims == 2 else value
-            )
-    for name, value in moved.items():
-        if name not in given:
-            value = value.numpy() if isinstance(value, Tensor) else value
-            result[name] = value[0] if name.endswith(_VALID) and value.ndim == 3 else value
-    return result
 
 
 def _numbers(value: Any, name: str, kind: str | None) -> Any:
