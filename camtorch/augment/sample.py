@@ -184,8 +184,7 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def __new__(cls, *args: Any, **options: Any) -> Self:
         """Check the names of arguments, which Python would only call unexpected."""
-        known = _keywords(cls)  # type: ignore[arg-type]  # a class can be hashed
-        if word := next((word for word in options if word not in known), None):
+        if word := next((word for word in options if word not in _keywords(cls)), None):  # type: ignore[arg-type]
             raise TypeError(f"{cls.__name__}: unknown keyword {word!r}; {cls._meant(word)}. {LEFT}")
         if args:
             _, *own = (p for p in inspect.signature(cls.__init__).parameters.values() if p.kind is not p.VAR_KEYWORD)
