@@ -309,9 +309,5 @@ int64_t THIS(draws)(Draws *d) {
         turned(d, c);
         if (d->share > 0 && !(left & NO_CAMERA)) left |= fill_knowing(d, c, &lens);
     }
-    const void *made[] = {d->made.intrinsics, d->rotations, d->distortion};
-    const int64_t sizes[] = {4, 9, d->count};
-    for (int i = 0; i < 3; i++)
-        if (d->copies[i]) memcpy(d->copies[i], made[i], (size_t)sizes[i] * (d->made.is_double ? sizeof(double) : sizeof(float)));
     return left;
 }

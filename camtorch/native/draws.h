@@ -44,7 +44,6 @@ typedef struct {
     Cameras made;                /* the new cameras; as given, what else the base has of its lens, which a new one then has */
     void *rotations, *distortion; /* (c, 9) and (c, count), in `room` */
     int64_t followed;            /* of how many new lenses `limits2` and `extent` are */
-    void *copies[3];             /* of the only camera: its intrinsics, rotation and coefficients once more; or NULL */
 } Draws;
 
 #endif

@@ -7,7 +7,7 @@ from ctypes import POINTER, c_char_p, c_double, c_int32, c_int64, c_uint32, c_vo
 
 from camtorch.native.structure import Calls, Numbers, Struct
 
-CHECKSUM = 1830311450
+CHECKSUM = 3689361709
 
 UINT8 = 0
 BOOL = 1
@@ -567,7 +567,6 @@ class Draws(Struct):
         ("rotations", c_void_p),
         ("distortion", c_void_p),
         ("followed", c_int64),
-        ("copies", c_void_p * 3),
     )
     values: int | None
     first: Numbers
@@ -600,7 +599,6 @@ class Draws(Struct):
     rotations: int | None
     distortion: int | None
     followed: int
-    copies: Numbers
 
 
 class Poses(Struct):
