@@ -50,47 +50,13 @@ class FilledOptions(EditOptions, total=False):
 class Augmentation(SampleTransform):
     """A random change of cameras, `sample -> sample`: every field moves by the same warps.
 
-    A sample is a dict, or keyword arguments, with any of these fields. They hold a batch, or without B a single sample.
-    A name may go on after an underscore, as in `gaze_left` or `mask_iris`. If the number of masks, points or boxes
-    differs between samples, pass a list with a tensor for each sample.
-
-    * `image` (B, C, H, W). `mask` (B, C, H, W) or (B, H, W) of any dtype takes the nearest value. So do `depth` along z
-      and `distance` along the ray.
-    * `keypoints` (B, N, 2), of several faces (B, F, N, 2), or OpenCV's (B, N, 1, 2); `polygons` (B, M, K, 2); `boxes`
-      (B, M, 4) as x1 y1 x2 y2, `boxes_xywh` as x y width height, `boxes_cxcywh` as x y of the centre, width, height;
-      all in pixels. Count and order stay. `keypoints_valid` and so on come out as bool: the point lies on the new
-      image, and was valid before. A box with x2 < x1 or y2 < y1, or a negative side, is invalid.
-    * `points` (B, *N, 3) of the camera frame. `landmarks` are keypoints or points, by their last dim.
-    * `gaze`, `directions` (B, *N, 3) turn by R. `pitch_yaw` (B, *N, 2) is a gaze in the angles of ETH-XGaze.
-    * `head_pose`, `pose` (B, 4, 4), camera from head; or `rvec` (B, 3) and `tvec` (B, 3) of OpenCV.
-    * `camera`: the camera of the image, one for all, a batch, a `ct.Mixed` of any models, or a list of single ones.
-      The camera of the new image comes out, and all 3D fields hold for it.
-
-    An image (B, T, C, H, W) holds clips: all frames of a clip move by one draw. All fields are then (B, T, ...), and
-    the camera is one for all or (B,). `BoxCrop` looks at the box of the first frame.
-
-    `rotation` (B, 3, 3) comes out: `ray_after = R ray_before`, over all augmentations that the sample went through.
-    Other fields stay as they are. `.eval()` changes nothing: call an augmentation in training only. An unknown name
-    that holds numbers which might be geometry, also in a dict in the sample, raises an error; `fields` gives its kind.
-
-    Turning the camera and changing its lens move all of it exactly. Moving the camera elsewhere shifts near things
-    against far ones, which takes depth: `RandomMount(shift=...)` does it for samples that have some.
-
-    Gradients go to images, labels and a sample's camera that learns; what a lens is jittered by counts as given, and so
-    does what it is zoomed by for `min_filled`.
-
-    **One's own augmentation** is a subclass that names the ranges it draws from, and writes `new_camera`: the camera
-    after the change, and how far it is turned. All fields, front ends, replays and options then come by themselves:
-
-        class Nearer(ct.augment.Augmentation):
-            def __init__(self, zoom=(1.0, 2.0), **options):
-                super().__init__({"zoom": ct.augment.Range(*zoom)}, **options)
-
-            def new_camera(self, source, values):
-                one = torch.ones_like(values["zoom"])
-                scale = torch.stack((values["zoom"], values["zoom"], one, one), -1)
-                intrinsics = source.intrinsics * scale
-                return source.replace(intrinsics=intrinsics), None
+    A sample is a dict, or keyword arguments: a batch, or without the dim B a single sample. The guide "Labels that move
+    with the image" (docs/guides/augment.md) has a table of all fields. `keypoints_valid` and so on, `camera`, and
+    `rotation` (B, 3, 3) come out as well: `ray_after = R ray_before`, over all augmentations that the sample went
+    through. Other fields stay, but an unknown name that holds numbers which might be geometry raises an error.
+    `.eval()` changes nothing: call an augmentation in training only. Gradients go to images, labels and a sample's
+    camera that learns; what a lens is jittered by, or zoomed by for `min_filled`, counts as given. A subclass that
+    names ranges and writes `new_camera` is one's own augmentation (docs/contributing/augmentation.md).
 
     Args:
         ranges: name -> `Range`, in the order in which they are drawn.
