@@ -354,7 +354,7 @@ class Augmentation(SampleTransform):
             each = clips.shape[1]  # of what a draw needs of a sample, that of the first frame counts
             named = self._sorted(frames, self.fields)
             firsts = {name: value[::each] for name, (_, value) in named.items()}
-            plan = Plan({name: kind for name, (kind, _) in named.items()}, True, clips.shape[0], ())
+            plan = Plan({name: kind for name, (kind, _) in named.items()}, True, clips.shape[0], (), None)
             first = Batch(plan, firsts, cast("Any", own), True)
             draw = {n: clips.repeated(value, f"draw[{n!r}]") for n, value in self._of_sample(drawn, first).items()}
             return clips.restored(self.forward(frames, draw=draw))

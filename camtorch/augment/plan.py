@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -29,7 +29,7 @@ class Plan:
     batched: bool
     count: int
     masks: Sequence[str]  # names of the masks of validity that come out: "image_valid" and so on
-    calls: Kept = field(default_factory=Kept)  # the names of the fields that one call moves, and the call
+    calls: Kept | None  # the names of the fields that one call of C moves, and the call; None in compiled code
 
     def rows(self, value: Any) -> Any:
         """Return a value with a dim B; a list has one already."""
@@ -44,7 +44,7 @@ class Plan:
         """
         part = change.parts[0]
         moves = part.moves
-        if moves is None or part.rows is not None or change.gate is not None or not self.count:
+        if moves is None or part.rows is not None or change.gate is not None or not self.count or self.calls is None:
             return {}
         if (between := part.between()) is None:
             return {}

@@ -390,7 +390,8 @@ class SampleTransform(KeepsCamera, nn.Module):
             ["image_valid", *(f"{name}_valid" for name, (kind, _) in named.items() if kind in IMAGES)]
         )
         masks = [key for key in flags if sample.get(key) is not None or (self.valid_mask and key == "image_valid")]
-        plan = Plan({name: kind for name, (kind, _) in named.items()}, batched, count, masks)
+        calls = None if torch.compiler.is_compiling() else Kept()
+        plan = Plan({name: kind for name, (kind, _) in named.items()}, batched, count, masks, calls)
         return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, True)
 
     def _check_cameras(self, camera: object, count: int, named: Named) -> None:
