@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -12,9 +12,8 @@ from typing_extensions import Unpack
 
 from camtorch.augment.change import Change, Part, alone, as_one, by_kinds, check_sizes
 from camtorch.augment.devices import Elsewhere, remember_camera, twin_of
-from camtorch.augment.fields import BOXES, FRONT_ENDS, as_corners
+from camtorch.augment.fields import BOXES, FRONT_ENDS, Named, as_corners
 from camtorch.augment.filling import enough, filled, scaled
-from camtorch.augment.plan import Batch, Plan
 from camtorch.augment.ranges import Range, draw
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
@@ -352,11 +351,9 @@ class Augmentation(SampleTransform):
             frames = clips.frames(alone(own) if isinstance(own, Camera) else own)
             drawn = self.drawn(clips.shape[0], self.p, self.same_on_batch, generator) if draw is None else draw
             each = clips.shape[1]  # of what a draw needs of a sample, that of the first frame counts
-            named = self._sorted(frames, self.fields)
-            firsts = {name: value[::each] for name, (_, value) in named.items()}
-            plan = Plan({name: kind for name, (kind, _) in named.items()}, True, clips.shape[0], (), None)
-            first = Batch(plan, firsts, cast("Any", own), True)
-            draw = {n: clips.repeated(value, f"draw[{n!r}]") for n, value in self._of_sample(drawn, first).items()}
+            first = {n: (kind, value[::each]) for n, (kind, value) in self._sorted(frames, self.fields).items()}
+            whole = self._of_sample(drawn, lambda: first)
+            draw = {n: clips.repeated(value, f"draw[{n!r}]") for n, value in whole.items()}
             return clips.restored(self.forward(frames, draw=draw))
         return self._augmented(sample, draw=draw, generator=generator)[0]
 
@@ -372,9 +369,9 @@ class Augmentation(SampleTransform):
         plan, camera, count = batch.plan, batch.camera, batch.plan.count
         if draw is None:
             numbers = self._numbers(count, self.p, self.same_on_batch, generator)
-            change = self._changed(camera, self._of_sample(numbers, batch))
+            change = self._changed(camera, self._of_sample(numbers, batch.rows))
         else:
-            change = self.change(camera, self._of_sample(draw, batch))
+            change = self.change(camera, self._of_sample(draw, batch.rows))
         if change.count != count:
             one = f"{{name: value.expand({count}, *value.shape[1:]) for name, value in draw.items()}} uses it for all"
             raise ValueError(
@@ -426,11 +423,11 @@ class Augmentation(SampleTransform):
             )
         return self.moved_by(change.inverse(), sample, predicted=True)
 
-    def _of_sample(self, draw: Mapping[str, Any], batch: Batch) -> Mapping[str, Any]:
+    def _of_sample(self, draw: Mapping[str, Any], rows: Callable[[], Named]) -> Mapping[str, Any]:
         """Add to a draw the boxes that it needs of a sample: those named `boxes`, or the first of that kind."""
         if not self.crops:
             return draw
-        found: dict[str, Any] = {name: pair for name, pair in batch.rows().items() if pair[0] in BOXES}
+        found: dict[str, Any] = {name: pair for name, pair in rows().items() if pair[0] in BOXES}
         kind, boxes = found.get("boxes", next(iter(found.values()), ("boxes", None)))
         if kind != "boxes":
             boxes = [as_corners(kind, b) for b in boxes] if isinstance(boxes, list) else as_corners(kind, boxes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
@@ -12,7 +12,7 @@ from typing_extensions import Unpack
 
 from camtorch.augment.cameras import Auto, CameraDrawer, LensOptions
 from camtorch.augment.change import Part
-from camtorch.augment.plan import Batch
+from camtorch.augment.fields import Named
 from camtorch.augment.presets import PresetName
 from camtorch.augment.ranges import RangeLike, as_range
 from camtorch.cameras.camera import Camera
@@ -137,17 +137,18 @@ class RandomMount(CameraDrawer):
         for name, each in zip(_SHIFTS, shift, strict=True):
             self.ranges[name] = as_range(each, "shift", self._name)
 
-    def _of_sample(self, draw: Mapping[str, Any], batch: Batch) -> Mapping[str, Any]:
-        draw = super()._of_sample(draw, batch)
+    def _of_sample(self, draw: Mapping[str, Any], rows: Callable[[], Named]) -> Mapping[str, Any]:
+        draw = super()._of_sample(draw, rows)
         if _SHIFTS[0] not in self.ranges:
             return draw
+        named = rows()
         for key, (field, _) in _DEPTHS.items():
-            for found, value in batch.rows().values():
+            for found, value in named.values():
                 if found == field and isinstance(value, Tensor):
                     return {**draw, key: value if value.ndim == 4 else value[:, None]}
         raise ValueError(
             f"{self._name}: with shift the sample must have depth (B, 1, H, W) or distance, as near things shift "
-            f"against far ones; got {', '.join(batch.plan.fields)}. Without shift, yaw, pitch, roll and zoom are exact"
+            f"against far ones; got {', '.join(named)}. Without shift, yaw, pitch, roll and zoom are exact"
         )
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:

@@ -242,7 +242,8 @@ class SampleTransform(KeepsCamera, nn.Module):
     @property
     def antialias(self) -> bool | None:
         """The option of that name; None if each warp decides."""
-        return self.options["antialias"] if self.__dict__["antialias"] is not None else None
+        given = self.__dict__.get("antialias", False)  # states of 0.4 may lack it
+        return None if given is None else self.options["antialias"]
 
     @antialias.setter
     def antialias(self, value: bool | None) -> None:
@@ -390,7 +391,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             ["image_valid", *(f"{name}_valid" for name, (kind, _) in named.items() if kind in IMAGES)]
         )
         masks = [key for key in flags if sample.get(key) is not None or (self.valid_mask and key == "image_valid")]
-        calls = None if torch.compiler.is_compiling() else Kept()
+        calls = Kept() if are_free() else None
         plan = Plan({name: kind for name, (kind, _) in named.items()}, batched, count, masks, calls)
         return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, True)
 

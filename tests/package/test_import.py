@@ -4,7 +4,6 @@ import os
 import pickle
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -36,11 +35,6 @@ heavy |= set() if "lenses" in sys.argv else {"torch", "numpy", "camtorch.cameras
 print("loaded:", sorted(heavy & set(sys.modules)), gc.isenabled())
 """
     assert "loaded: [] True" in python(code, *words)
-
-
-def test_every_file_of_models_is_listed():
-    files = {path.stem for path in Path(ct.models.__file__).parent.glob("[!_]*.py")}
-    assert {getattr(ct, name).__module__.rpartition(".")[2] for name in ct.models.__all__ if name != "MODELS"} == files
 
 
 FIRST_USES = {
