@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, ClassVar, Literal
 
@@ -199,7 +199,8 @@ class CameraDrawer(Augmentation):
         """Return what compiled code makes of a draw; None where something is recorded, or it does not know a model."""
         if type(self).new_camera is not CameraDrawer.new_camera:
             return None
-        tensors = self._tensors_of(source)
+        like = self._like_for(source)
+        tensors = source.intrinsics, source.distortion, *(() if like is None else like.tensors)
         if isinstance(next(iter(values.values()), None), Tensor) or not are_numbers(*tensors):
             return None
 
@@ -212,22 +213,13 @@ class CameraDrawer(Augmentation):
         if self._is_real:
             found = start()
         else:
-            key = self._key(source, values, share)
+            # all else that new cameras depend on
+            own = self._calls.revision, like and like.image_size, self.ranges.get("fov"), share
+            key = "start", type(source), source.image_size, *own, *values
             known = self._memo.entry(tensors, key)
             found = self._memo(tensors, key, start) if known is None else known[2]
-        own = self.like is None and not self._is_real
-        return None if found is None else found.drawn(values, source if own else found.base, self.options)
-
-    def _tensors_of(self, source: Camera) -> tuple[Tensor, ...]:
-        """Return the tensors that new cameras depend on."""
-        if self.like is None:
-            return source.tensors
-        return *source.tensors, *self._like_for(source).tensors  # type: ignore[union-attr]
-
-    def _key(self, source: Camera, names: Iterable[str], share: float | None) -> tuple[Any, ...]:
-        """Return all else that what new cameras are drawn from depends on."""
-        own = self._calls.revision, self.like and self.like.image_size, self.ranges.get("fov"), share
-        return "start", type(source), source.image_size, self._size_of(source), *names, *own
+        own_lens = like is None and not self._is_real
+        return None if found is None else found.drawn(values, source if own_lens else found.base, self.options)
 
     def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._values(source, draw)

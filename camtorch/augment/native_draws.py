@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from ctypes import addressof, c_double
+from ctypes import addressof, c_double, c_float
 from functools import lru_cache, partial
 from typing import Any
 
@@ -34,9 +34,9 @@ _TURNS = {"yaw", "pitch", "roll"}
 
 
 @lru_cache(maxsize=64)
-def _doubles(count: int) -> Any:
+def _array(kind: type[c_double | c_float], count: int) -> Any:
     """Return the type of an array; ctypes makes a new one each time, in more time than the array takes."""
-    return c_double * count
+    return kind * count
 
 
 class Start:
@@ -80,7 +80,7 @@ class Start:
         self.names: list[str] = [name for name in _KINDS if name in names]
         self._rows = len(sized) if sized.ndim == 2 else native.cameras if base.batch_shape else 0
         self._turns, self._moves, self._knows = not _TURNS.isdisjoint(names), nominal is not None, False
-        self.dtype: torch.dtype = native.dtype
+        self._kinds = (c_float, np.float32) if native.dtype == torch.float32 else (c_double, np.float64)
         self._follows = False  # whether new lenses want limits
         self._distortion = base.distortion.detach()
         count = self._distortion.shape[-1]
@@ -124,7 +124,7 @@ class Start:
         self._knows, call.places = True, self._keep(plan.places)
         self._room += plan.parameters + 4 + TABLE_WIDTH
 
-    def _limits(self, call: structs.Draws, rows: int) -> list[Tensor]:
+    def _limits(self, call: structs.Draws, rows: int) -> list[Any]:
         """Give room for the limits of new lenses."""
         kept = [
             torch.empty(rows * count, dtype=self._native.dtype, device="cpu")
@@ -133,7 +133,7 @@ class Start:
         call.made.limits2, call.made.extent = (tensor.data_ptr() for tensor in kept)
         return kept
 
-    def _made(self, call: structs.Draws, kept: list[Tensor], rows: int) -> Native:
+    def _made(self, call: structs.Draws, kept: list[Any], rows: int) -> Native:
         """Return the new cameras for compiled code."""
         native = self._native
         lenses = partial(self._lenses, kept[0], rows) if self._knows else lambda _: native.lenses
@@ -141,28 +141,32 @@ class Start:
 
     def drawn(self, values: Mapping[str, Any], base: Camera, options: Options) -> Drawn:
         """Return the new cameras, modules like `base`, of values (B,) and (B, size), or numbers and lists for one."""
-        call, native = structs.Draws.from_buffer_copy(self._call), self._native
-        given = [values[name] for name in self.names]
-        first = given[0] if given else None
+        call, native, names = structs.Draws.from_buffer_copy(self._call), self._native, self.names
+        first = values[names[0]] if names else None
         rows = self._rows or (len(first) if isinstance(first, np.ndarray) else 1)
         is_one = not self._rows and not isinstance(first, np.ndarray)
-        filled = _doubles(2 * rows)()  # the factors, and what is filled
-        numbers: Any
+        given: Any
         if is_one:
             flat: list[float] = []
-            for value in given:
+            for name in names:
+                value = values[name]
                 flat += value if isinstance(value, list) else (value,)
-            numbers = _doubles(len(flat))(*flat)
-            call.values = addressof(numbers)
-        elif given:
-            numbers = np.concatenate(given, None)
-            call.values = numbers.ctypes.data
-        room = torch.empty(rows * self._room, dtype=self.dtype, device="cpu")
+            given = _array(c_double, len(flat))(*flat)
+            call.values = addressof(given)
+        elif names:
+            given = np.concatenate([values[name] for name in names], None)
+            call.values = given.ctypes.data
+        filled = _array(c_double, 2 * rows)()  # the factors, and what is filled
+        # numpy cuts this in half the time of torch
+        kind, dtype = self._kinds
+        room = _array(kind, rows * self._room)()
+        numbers = np.frombuffer(room, dtype)
         call.cameras = call.made.cameras = rows
-        call.room, call.factors = room.data_ptr(), addressof(filled)
+        call.room, call.factors = addressof(room), addressof(filled)
         call.filled = call.factors + 8 * rows
         tries = self._tries(values, rows, call) if rows and self._moves and not self._knows else None
-        kept, run = [room], loaded().camtorch_draws
+        kept: list[Any] = [numbers]
+        run = loaded().camtorch_draws
         if self._follows:  # some lenses have wanted limits
             kept += self._limits(call, rows)
         while (left := run(call)) & ~structs.NO_CAMERA:
@@ -179,20 +183,19 @@ class Start:
             self._follow(left, call)
         if call.followed < rows and self._moves:
             call.made.limits2 = call.made.extent = None
-        intrinsics, rotation = room[: 4 * rows], room[4 * rows : 13 * rows] if self._turns else None
-        k = room[13 * rows : (13 + call.count) * rows] if self._moves else self._distortion
+        several = () if is_one else (rows,)
+        intrinsics, rotation, k = torch.from_numpy(numbers[: 4 * rows].reshape(*several, 4)), None, self._distortion
+        if self._turns:
+            rotation = torch.from_numpy(numbers[4 * rows : 13 * rows].reshape(*several, 3, 3))
+        if self._moves:
+            k = torch.from_numpy(numbers[13 * rows : (13 + call.count) * rows].reshape(*several, call.count))
         made = None
         if not left and (self._knows or not self._moves) and (self._knows or native.cameras == rows):
             made = self._made(call, kept, rows)
         elif is_one and not left:
             made = single_native(model_of(self.base), intrinsics, k)
-        if is_one:
-            turned = None if rotation is None else rotation.view(3, 3)
-        else:
-            turned = None if rotation is None else rotation.view(rows, 3, 3)
-            intrinsics, k = intrinsics.view(rows, 4), k.view(rows, call.count) if self._moves else k
         factor, found = filled[:rows], filled[rows:]
-        return Drawn(base, intrinsics, k, self.size, turned, options, self.before, made, factor, found)
+        return Drawn(base, intrinsics, k, self.size, rotation, options, self.before, made, factor, found)
 
     def _follow(self, left: int, call: structs.Draws) -> None:
         """Find what C has asked for of the cameras that it starts from."""
@@ -219,9 +222,9 @@ class Start:
         call.hold((tried, allowed))
         return native
 
-    def _lenses(self, room: Tensor, rows: int, made: Native) -> Lenses:
+    def _lenses(self, numbers: Any, rows: int, made: Native) -> Lenses:
         """Return what was found of new lenses, kept for whoever evaluates cameras of their coefficients."""
         model, count = model_of(self.base), self._call.count
-        k = room[13 * rows : (13 + count) * rows].view(rows, count)
+        k = torch.from_numpy(numbers[13 * rows : (13 + count) * rows].reshape(rows, count))
         domain = partial(domain_for, model, k, False)
         return lenses_of(made.plan, k, lambda: Lenses.known(made.plan, model.optics, k, domain, made))

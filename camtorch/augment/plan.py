@@ -13,7 +13,7 @@ from camtorch.augment.change import Change, Drawn
 from camtorch.augment.fields import KINDS, field_of, in_range
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.tensors import are_free, are_numbers
+from camtorch.evaluate.tensors import are_numbers
 from camtorch.values.threads import thread_count
 from camtorch.warp.samples import Label, call_for
 from camtorch.warp.sampling import Options, Sampler
@@ -29,7 +29,7 @@ class Plan:
     batched: bool
     count: int
     masks: Sequence[str]  # names of the masks of validity that come out: "image_valid" and so on
-    calls: Kept | None  # the names of the fields that one call of C moves, and the call; None in compiled code
+    calls: Kept | None  # the names of the fields that one call of C moves, and the call; None if a graph may want them
 
     def rows(self, value: Any) -> Any:
         """Return a value with a dim B; a list has one already."""
@@ -66,7 +66,7 @@ class Plan:
         else:
             names, call = known[2]
         given = [values[name] for name in names]
-        moved = call(source, target, rotation, given) if call is not None and are_free(*given) else None
+        moved = None if call is None else call(source, target, rotation, given)
         results: dict[str, tuple[Tensor, Tensor | None]] = {}
         for name, value, result in zip(names, given, moved or (), strict=bool(moved)):
             if result is not None:

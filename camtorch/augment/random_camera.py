@@ -138,7 +138,7 @@ class RandomMount(CameraDrawer):
             self.ranges[name] = as_range(each, "shift", self._name)
 
     def _of_sample(self, draw: Mapping[str, Any], rows: Callable[[], Named]) -> Mapping[str, Any]:
-        draw = super()._of_sample(draw, rows)
+        draw = super()._of_sample(draw, rows) if self.crops else draw
         if _SHIFTS[0] not in self.ranges:
             return draw
         named = rows()

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.tensors import are_free
+from camtorch.evaluate.door import is_eager
 from camtorch.values.arguments import as_number, shown, warn
 
 RangeLike = float | Sequence[float]
@@ -135,7 +135,7 @@ def draw(
     applied: Any
     # in float64, so that what is drawn is what every precision sees
     shares: Any = torch.rand(spans.total, generator=generator, dtype=torch.float64, device=device)
-    if are_free(shares):
+    if is_eager(shares):
         if rows == count == 1:
             return {"apply": [p >= 1] if gate is None else gate.tolist(), **spans.single(shares.tolist())}, spans
         applied, shares = np.array([p >= 1] * rows, bool) if gate is None else gate.numpy(), shares.numpy()

@@ -284,7 +284,12 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def _clips(self, sample: Sample, kinds: Mapping[str, str] | None = None) -> Clips | None:
         """Return the clips of a sample, if an image has the dims (B, T, C, H, W)."""
-        if isinstance(sample, Single) or 5 not in [getattr(value, "ndim", 0) for value in sample.values()]:
+        if isinstance(sample, Single):
+            return None
+        for value in sample.values():
+            if getattr(value, "ndim", 0) == 5:
+                break
+        else:
             return None
         fields = {**self.fields, **(kinds or {})}
         given = {name: value for name, value in sample.items() if name not in OWN and value is not None}
@@ -332,7 +337,10 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def _form_of(self, sample: Sample, camera: object, fields: Mapping[str, str]) -> tuple[Any, ...] | None:
         """Return all that a plan depends on; None if a field is no tensor or number, or of a `Mixed`."""
-        if not isinstance(camera, Camera) or camera.is_mixed or not are_free():
+        if not isinstance(camera, Camera) or camera.is_mixed:
+            return None
+        is_free = are_free(*[value for value in sample.values() if isinstance(value, Tensor)])
+        if not is_free and not are_free():
             return None
         intrinsics, distortion = camera.intrinsics, camera.distortion
         # each thread has calls of its own
@@ -345,7 +353,7 @@ class SampleTransform(KeepsCamera, nn.Module):
                 parts += name, type(value)
             else:
                 return None
-        return *parts, self._calls.revision, *fields.items()
+        return *parts, is_free, self._calls.revision, *fields.items()
 
     def _checked_batch(self, sample: Sample, camera: Any, fields: Mapping[str, str], predicted: bool) -> Batch:
         if not (named := self._sorted(sample, fields)):
@@ -391,7 +399,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             ["image_valid", *(f"{name}_valid" for name, (kind, _) in named.items() if kind in IMAGES)]
         )
         masks = [key for key in flags if sample.get(key) is not None or (self.valid_mask and key == "image_valid")]
-        calls = Kept() if are_free() else None
+        calls = Kept() if are_free(*held.values()) else None
         plan = Plan({name: kind for name, (kind, _) in named.items()}, batched, count, masks, calls)
         return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, True)
 
@@ -479,7 +487,8 @@ class SampleTransform(KeepsCamera, nn.Module):
             options["lateral"] = self.mirroring.lateral
         together = {} if "image_valid" in plan.masks else plan.together(change, values, self.mask_fill)
         for name, kind in plan.fields.items():
-            value, valid = values[name], cast("Any", None)
+            value: Any = values[name]
+            valid: Any = None
             if name in together:
                 moved[name], valid = together[name]
             elif isinstance(value, list):

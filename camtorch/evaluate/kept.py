@@ -21,6 +21,7 @@ class Kept:
     values may not be read. Copies and pickles begin empty.
     """
 
+    capacity: int = 1
     result: Any = None  # the one that was returned last, for any inputs
     _kept: Sequence[tuple[tuple[Any, ...], list[Note], Any]] = ()  # the last one used is first
 

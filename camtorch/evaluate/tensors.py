@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from camtorch.evaluate.door import in_graph, in_transform, is_concrete, is_eager, is_recorded, keeps_graph, may_look
+from camtorch.evaluate.door import in_graph, in_transform, is_concrete, is_eager, is_recorded, may_look
 
 
 def known_false(condition: Tensor) -> bool:
@@ -51,7 +51,12 @@ def values_of(tensor: Tensor) -> Tensor | None:
 
 def are_free(*tensors: Tensor) -> bool:
     """Whether nothing records operations on tensors, which lie in the CPU's memory."""
-    return is_eager(*tensors) and not keeps_graph(*tensors)
+    if not is_eager(*tensors):
+        return False
+    for tensor in tensors if torch.is_grad_enabled() else ():  # noqa: SIM110 (as in `is_eager`)
+        if tensor.requires_grad:
+            return False
+    return True
 
 
 def are_numbers(*tensors: Tensor) -> bool:

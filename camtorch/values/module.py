@@ -295,7 +295,7 @@ def remade(module: Made, learns: bool = False, /, **changes: Any) -> Made:
         state.update(module.__dict__, _is_full_backward_hook=None, **changes)
         state.update(_containers())
         for name in module.memo_names:
-            state[name] = Kept()
+            state[name] = Kept.__new__(Kept)  # without a call of Python
         for name, tensor in tensors.items():
             if tensor.shape[-1]:
                 is_one = type(tensor) is nn.Parameter  # as of most: what `fixed` would ask
