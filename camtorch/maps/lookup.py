@@ -56,7 +56,7 @@ class Exact:
             grid = np.stack(np.meshgrid(columns, rows[here]), -1)
             pixels = torch.from_numpy(grid).to(self.warp.target.intrinsics.device)
             with torch.no_grad():
-                moved, valid = self._back._move(pixels.expand(*self.warp.batch_shape, *grid.shape))
+                moved, valid = self._back.move(pixels.expand(*self.warp.batch_shape, *grid.shape))
             positions[here] = moved.double().cpu().numpy().reshape(grid.shape)
             mapped[here] = valid.cpu().numpy().reshape(grid.shape[:-1])
         return positions, mapped

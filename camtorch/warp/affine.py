@@ -19,11 +19,11 @@ from camtorch.native.sampler import maker
 from camtorch.native.structs import STEP
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
-from camtorch.warp import compiled
+from camtorch.warp import operators
 from camtorch.warp.grid import Lattice, Sampling, coarse, straight_lattice
 from camtorch.warp.moving import placed
 from camtorch.warp.panorama import lengths
-from camtorch.warp.plan import Route, lengthened, positions, route_of, warped
+from camtorch.warp.plan import Route
 from camtorch.warp.sampling import SHRINKS, PaddingMode, Sampler, render
 from camtorch.warp.warp import Warp
 
@@ -61,19 +61,19 @@ class MirrorWarp(Warp):
         self._decides = antialias is None
         self._halvings: list[int] | None = None
 
-    def _warped(self, images: Tensor, sampler: Sampler) -> Tensor:
+    def warped(self, images: Tensor, sampler: Sampler) -> Tensor:
         """Return warped images, each row in its own way: images that shrink are resized or halved."""
         smooth = sampler.mode != "nearest" and images.dtype != torch.bool
         called = torch.compiler.is_compiling() and not torch.onnx.is_in_onnx_export()
-        if called and self._depends(smooth) and not keeps_graph(images, *self._inputs()):
+        if called and self._depends(smooth) and not keeps_graph(images, *self.tensors):
             options = None if self._decides else self.antialias, sampler.padding_mode, sampler
             cameras = self.source, self.target, self.rotation
             matrix = None if self.map is None else as_tensor(self.map)
-            return compiled.warped(images, *cameras, self.tolerance, *options, matrix, _edited)
-        route = route_of(self, images)
+            return operators.warped(images, *cameras, self.tolerance, *options, matrix, _edited)
+        route = self.route(images)
         ways = None if in_transform() else self._ways(sampler, smooth, route)
         if not ways:
-            return warped(self, images, sampler)
+            return super().warped(images, sampler)
         images = images.expand(len(ways), -1, -1, -1) if len(ways) > 1 else images
         if all(way == ways[0] for way in ways):
             return self._made(images, ways[0], sampler)
@@ -100,7 +100,7 @@ class MirrorWarp(Warp):
             return None
         if self._halvings is None:
             own = self.host or self  # no device is waited for
-            self._halvings = _halvings(positions(own, "kept", sampler.padding_mode), own._sampled)
+            self._halvings = _halvings(own.positions("kept", sampler.padding_mode), own.sampled)
         return [Way(sampler.padding_mode, k) for k in self._halvings] if any(self._halvings) else None
 
     def _made(
@@ -132,11 +132,11 @@ class MirrorWarp(Warp):
             return made if out is None else out.copy_(made)
         sampler = sampler._replace(padding_mode=way.padding_mode)
         if rows is None and not way.halvings:
-            return warped(self, images, sampler)
-        images = lengthened(self, images)
+            return super().warped(images, sampler)
+        images = self.lengthened(images)
         if way.halvings:
             images = _resized(images, [max(-(-side >> way.halvings), 1) for side in images.shape[-2:]])
-        where = positions(self, route_of(self, images), way.padding_mode)
+        where = self.positions(self.route(images), way.padding_mode)
         return render(images, where if rows is None else where.cameras(rows), *sampler)
 
     def _empty(self, images: Tensor) -> Tensor:
@@ -158,7 +158,7 @@ class AffineWarp(MirrorWarp):
     """
 
     is_an_operator = False
-    _seam = None
+    seam = None
     map: Map
     matrix: Tensor
 
@@ -201,10 +201,11 @@ class AffineWarp(MirrorWarp):
         sizes = self.source.size_for("Warp"), self.target.size_for("Warp")
         return [_way(rows, *sizes, sampler.padding_mode, least, decides) for rows in self._numbers]
 
-    def _inputs(self) -> list[Tensor]:
+    @property
+    def tensors(self) -> list[Tensor]:
         return [self.matrix]
 
-    def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
+    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
         width = self.target.size_for("Warp")[1]
         back = inverted(self.matrix.reshape(-1, 2, 3))
         side = back.new_tensor(self.source.size_for("Warp")[::-1])[:, None]
@@ -223,7 +224,7 @@ class AffineWarp(MirrorWarp):
         scale = (back[:, :, :2] * side / 2).abs().sum(-1).amax(-1)
         return Sampling(grid, mapped, scale.to(dtype)[:, None, None].expand(mapped.shape).contiguous())
 
-    def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
+    def move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         pixels = as_values(pixels, "pixels", "Warp", self.matrix.device)
         pixels = pixels if pixels.is_floating_point() else pixels.to(self.source.intrinsics.dtype)
         valid = torch.isfinite(pixels).all(-1)
@@ -293,18 +294,18 @@ def _halvings(where: Sampling | Lattice, source: Camera) -> list[int]:
     return [_halved(scale) for scale in (total / (count.clamp(min=1) * step)).tolist()]
 
 
-@opaque(compiled.warp_shapes)
+@opaque(operators.warp_shapes)
 def _edited(
     images: Tensor, source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, *options: Any
 ) -> tuple[Tensor]:
-    """Return the images of an edit, made in the way that its values choose; see `compiled.warped` for the options."""
+    """Return the images of an edit, made in the way that its values choose; see `operators.warped` for the options."""
     antialias, _, mode, padding_mode, fill, matrix, is_last = options
     how: Any = {"mode": mode, "padding_mode": padding_mode, "fill": ast.literal_eval(f"({fill},)")}
     how |= {"antialias": ast.literal_eval(antialias), "tolerance": tolerance}
     warp: Warp = MirrorWarp(source, target, rotation, **how)
     if matrix is not None:
         warp = AffineWarp(source, target, matrix, rotation, **how)
-    return (compiled.laid(warp(images), is_last),)
+    return (operators.laid(warp(images), is_last),)
 
 
 def as_tensor(matrix: Map) -> Tensor:

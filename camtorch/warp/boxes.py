@@ -9,8 +9,8 @@ from camtorch.evaluate.devices import sent
 from camtorch.evaluate.tensors import is_predicted, known_true
 from camtorch.native.structs import EDGE_POINTS
 from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes
-from camtorch.warp.pair import CameraPair
 from camtorch.warp.panorama import PANORAMAS
+from camtorch.warp.plan import CameraPair
 
 _ROUNDED = 1e-3  # pixels from a panorama's edges, where rounding would cost rays
 _LATTICE = 16  # steps across and down the target, between points that are tested against a polygon
@@ -36,7 +36,7 @@ def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
     if corners.ndim < 2:
         raise ValueError(f"Warp: corners must be (B, *N, K, 2); got shape {tuple(corners.shape)}")
     finite = torch.isfinite(corners).flatten(-2).all(-1, keepdim=True)
-    moved, mapped = warp._move(along_edges(corners, EDGE_POINTS))
+    moved, mapped = warp.move(along_edges(corners, EDGE_POINTS))
     mapped = mapped & finite
     low = torch.where(mapped.unsqueeze(-1), moved, torch.inf).amin(-2)
     high = torch.where(mapped.unsqueeze(-1), moved, -torch.inf).amax(-2)
@@ -62,7 +62,7 @@ def _inside(warp: CameraPair, corners: Tensor, like: Tensor) -> tuple[Tensor, Te
         share = share.clamp(_ROUNDED / height, 1 - _ROUNDED / height)
     lattice = torch.cartesian_prod(share * width, share * height) - 0.5
     with torch.no_grad():
-        shown, seen = (host or warp)._move(lattice.expand(*warp.batch_shape, *lattice.shape), back=True)
+        shown, seen = (host or warp).move(lattice.expand(*warp.batch_shape, *lattice.shape), back=True)
         if host is not None:
             lattice, shown, seen = sent([lattice, shown, seen], device)
         if warp.batch_shape:

@@ -1,33 +1,46 @@
-"""How a warp samples images: the route is found once for a form of call, and kept while its cameras stay."""
+"""Two cameras at one place, and the way that images and points go from one to the other.
+
+The route of images is found once for a form of call, and kept while the cameras stay.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import Literal
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, ClassVar, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from typing_extensions import Self
 
+from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import (
     in_graph,
     in_jit_trace,
+    in_transform,
     is_constant,
     is_eager,
-    is_exporting,
     is_for_here,
     keeps_graph,
+    outside_inference,
     records_constants,
     set_aside,
 )
 from camtorch.evaluate.export import with_values
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import is_unknown
 from camtorch.native.sampler import Call, maker
-from camtorch.warp import compiled
-from camtorch.warp.grid import Lattice, Sampling, local_scale
-from camtorch.warp.pair import CameraPair, Plan
+from camtorch.values.arguments import Numbers, broadcast_shapes
+from camtorch.values.module import GeometryModule
+from camtorch.warp import operators
+from camtorch.warp.grid import Lattice, Sampling, local_scale, locate
+from camtorch.warp.moving import moved_pixels
+from camtorch.warp.panorama import Seam, seam_of
 from camtorch.warp.sampling import (
     PADDINGS,
+    Mode,
+    Options,
     PaddingMode,
     Pyramid,
     Sampler,
@@ -40,195 +53,319 @@ from camtorch.warp.sampling import (
 Route = Literal["operator", "strips", "graph", "kept"]
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
 _STRIP = 1 << 21  # pixels of such a strip
+_MOST_CALLS = 8  # forms of images for which a call is kept
+_SINGLE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels wide, computed in float32
 
 
-def route_of(warp: CameraPair, images: Tensor | None = None) -> Route:
-    """Return the route of images, or of positions alone; `locate` and `render` choose the lattice and the sampler.
+def _part(held: str, name: str) -> Any:
+    """Return a property of a module's part, read from its usual dict; `nn.Module.__getattr__` looks in all."""
 
-    * "operator": compiled code calls one operator, and traces nothing of it;
-    * "strips": the grid would be too long for memory, and is made part by part;
-    * "graph": something learns, so that positions are computed anew with their graph;
-    * "kept": positions without a graph, pinned or kept until an input changes.
-    """
-    learns = not warp.is_pinned and keeps_graph(*warp._inputs())
-    if images is not None:
-        learns = learns and images.dtype.is_floating_point
-        if not learns and _is_operator(warp) and compiled.takes(images, warp._inputs()):
-            return "operator"
-    if not learns and _is_long(warp) and (images is None or not in_graph(images)):
-        return "strips"
-    return "graph" if learns else "kept"
+    def part(module: nn.Module) -> Any:
+        parts = module.__dict__[held]
+        return parts[name] if name in parts else nn.Module.__getattr__(module, name)
+
+    return property(part)
 
 
-def ready(warp: CameraPair, images: object, mode: str | None, padding: str | None) -> Call | None:
-    """Return the call that an earlier one has left for images of this form, if nothing has changed since."""
-    plan: Plan | None = warp._kept.result
-    if plan is None or plan.calls.result is None or not isinstance(images, Tensor):
-        return None
-    mode, padding = warp.mode if mode is None else mode, warp.padding_mode if padding is None else padding
-    inputs = warp._inputs()
-    if not is_eager(images, *inputs) or images.requires_grad:
-        return None
-    found = plan.calls.entry((), _form(warp, images, mode, padding))
-    if found is None or not plan.is_pinned:
-        learns = images.dtype.is_floating_point and keeps_graph(*inputs)
-        if found is None or learns or warp._kept.entry(inputs, warp._options) is None:
+class Plan:
+    """The positions of a warp while its cameras stay, or once and for all, and calls that are ready for some images."""
+
+    def __init__(self, pinned: Sampling | Lattice | None = None, padding: str = "zeros"):
+        """Keep positions by the padding that they serve; `pinned` ones stay if the cameras change."""
+        self.is_pinned = pinned is not None
+        self.calls: dict[tuple[object, ...], Call] = {}
+        self.positions: dict[str, Sampling | Lattice] = {} if pinned is None else {padding: pinned}
+        self._exact = pinned if isinstance(pinned, Sampling) else None
+
+    def positions_for(self, padding: str, compute: Callable[[], Sampling | Lattice]) -> Sampling | Lattice:
+        """Return `compute()` without a graph, or what is kept; pinned positions that are exact serve all paddings."""
+        found = self.positions.get(padding) if self._exact is None else self._exact
+        if found is None:
+            if in_transform():  # a transform's tensors die with it
+                return compute()
+            with outside_inference(), torch.no_grad():
+                found = self.positions[padding] = compute()
+        return found
+
+
+class CameraPair(GeometryModule):
+    """The state of a `Warp`: source, target, rotation and options; and where target pixels lie."""
+
+    is_an_operator: ClassVar[bool] = True  # compiled code may call it as one, as cameras and rotation are all of it
+    keeps_lens: ClassVar[bool] = False  # True: it can follow another warp, as one warp that `follow` returns
+    batch_shape: torch.Size
+    padding_mode: PaddingMode
+    _tolerance: float | None
+    mode: Mode
+    fill: tuple[float, ...]
+    _kept: Kept
+    _host: Kept | None = None
+    source: Camera = _part("_modules", "source")
+    target: Camera = _part("_modules", "target")
+    rotation: Tensor | None = _part("_buffers", "rotation")
+    antialias: bool
+
+    def set_up(self, source: Camera, target: Camera, options: Options, batch: torch.Size | None = None) -> None:
+        """Give a new warp its cameras and options, which are valid."""
+        if batch is None:
+            batch = broadcast_shapes(source.batch_shape, target.batch_shape)
+        super().__init__(
+            {"source": source, "target": target},
+            batch_shape=batch,
+            mode=options["mode"],
+            padding_mode=options["padding_mode"],
+            fill=options["fill"],
+            antialias=options["antialias"],
+            _tolerance=options["tolerance"],
+            _kept=Kept(),
+        )
+        seam_of(source)  # while its values may be looked at: traced code asks for it too
+
+    def __dir__(self) -> list[str]:
+        """Return the names that users call, without those by which packages and other kinds of warps ask this one."""
+        inside = {*vars(CameraPair), *dir(GeometryModule), "rows_of", "follow"}
+        inside -= {"source", "target", "rotation", "tolerance", *dir(nn.Module)}
+        names: list[str] = super().__dir__()  # type: ignore[no-untyped-call]
+        return [name for name in names if name not in inside]
+
+    @classmethod
+    def unchecked(cls, *given: Any) -> Self:
+        """Return a warp, without a rotation yet, from valid arguments of `set_up`."""
+        warp = cls.__new__(cls)
+        warp.set_up(*given)
+        return warp
+
+    def turned_by(self, rotation: Tensor | None) -> Self:
+        """Give this warp, made without one, a rotation that is not checked, (3, 3) or (B, 3, 3); return the warp."""
+        self.put("rotation", rotation, persistent=rotation is not None and not rotation.requires_grad)
+        if rotation is not None and rotation.shape[:-2] != self.batch_shape:
+            self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
+        return self
+
+    @property
+    def is_pinned(self) -> bool:
+        """Whether positions stay whatever becomes of the cameras."""
+        plan: Plan | None = self._kept.result
+        return plan is not None and plan.is_pinned
+
+    @property
+    def host(self) -> Self | None:
+        """The same warp on the CPU, where this one is on another device and was made from it."""
+        host = self._host
+        if host is None or is_unknown(self.target.intrinsics):
             return None
-    call: Call = found[2]
-    return call
+        entry = host.entry(self.tensors, ())
+        return None if entry is None else entry[2]
 
+    def follow_host(self, host: CameraPair) -> Self:
+        """Have a warp like this one, on the CPU, find the positions while the cameras stay; return this warp."""
+        if not self.target.intrinsics.is_cpu:
+            self._host = Kept()
+            self._host(self.tensors, (), lambda: host)
+        return self
 
-def _form(warp: CameraPair, images: Tensor, mode: str, padding: str) -> tuple[object, ...]:
-    return images.shape, images.stride(), images.dtype, mode, padding, warp.fill
+    @property
+    def tolerance(self) -> float:
+        """Pixels of the source by which sampling positions may be off."""
+        if self._tolerance is not None:
+            return self._tolerance
+        single = self.source.intrinsics.dtype == self.target.intrinsics.dtype == torch.float32
+        return _SINGLE if single else 0.0
 
+    @property
+    def tensors(self) -> list[Tensor]:
+        """All tensors that positions depend on."""
+        (source, target), rotation = self._ends, self.rotation
+        found = [*source.tensors, *target.tensors]
+        return found if rotation is None else [*found, rotation]
 
-def warped(warp: CameraPair, images: Tensor, sampler: Sampler) -> Tensor:
-    """Return the images of a warp; those given are checked."""
-    route, given = route_of(warp, images), images
-    images = lengthened(warp, images)
-    if route == "operator":
-        options = warp.tolerance, warp.antialias, _reach(warp, sampler.padding_mode), sampler
-        return compiled.warped(images, warp._sampled, warp.target, warp.rotation, *options)
-    if route == "strips":
-        cameras = math.prod(warp.batch_shape)
-        result = maker(images, len(images) if cameras == 1 else cameras, warp.target.size_for("Warp"))()
-        kept: dict[int, Pyramid] = {}
-        for rows, where in strips(warp, sampler.padding_mode):
-            with torch.no_grad():
-                render(images, where, *sampler, kept, result[:, :, rows])
+    @property
+    def form(self) -> tuple[object, ...]:
+        """All that positions depend on in addition to `tensors`."""
+        source, target = self._ends
+        return source.form, target.form, self.rotation is None, self.antialias, self._tolerance
+
+    @property
+    def _ends(self) -> tuple[Camera, Camera]:
+        """Source and target, by which positions are found."""
+        return self.source, self.target
+
+    @property
+    def seam(self) -> Seam | None:
+        """By how much the source's images become longer before they are sampled."""
+        return seam_of(self._ends[0])
+
+    @property
+    def sampled(self) -> Camera:
+        """The source, of these longer images."""
+        source = self._ends[0]
+        seam = self.seam
+        return source if seam is None else seam.before(source)
+
+    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
+        """Return positions of some rows of the target, which serve a padding, within a tolerance."""
+        return locate(self.sampled, self._ends[1], self.rotation, tolerance, self.antialias, rows, padding)
+
+    def move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
+        """Return pixels of the source on the target's image, or back, and whether there is one; see `moved_pixels`."""
+        (source, target), rotation = self._ends, self.rotation
+        if back:
+            source, target, rotation = target, source, None if rotation is None else rotation.mT
+        return moved_pixels(source, target, rotation, pixels, on_image)
+
+    def route(self, images: Tensor | None = None) -> Route:
+        """Return the route of images, or of positions alone; `locate` and `render` choose the lattice and the sampler.
+
+        * "operator": compiled code calls one operator, and traces nothing of it;
+        * "strips": the grid would be too long for memory, and is made part by part;
+        * "graph": something learns, so that positions are computed anew with their graph;
+        * "kept": positions without a graph, pinned or kept until an input changes.
+        """
+        learns = not self.is_pinned and keeps_graph(*self.tensors)
+        if images is not None:
+            learns = learns and images.dtype.is_floating_point
+            if not learns and self.is_called(images):
+                return "operator"
+        if not learns and self._is_long and (images is None or not in_graph(images)):
+            return "strips"
+        return "graph" if learns else "kept"
+
+    def is_called(self, images: Tensor) -> bool:
+        """Whether code is compiled that calls this warp as an operator for images; it knows cameras of one model."""
+        return self._is_operator and operators.takes(images, self.tensors)
+
+    @property
+    def _is_operator(self) -> bool:
+        return is_for_here() and self.is_an_operator and not (self.source.is_mixed or self.target.is_mixed)
+
+    @property
+    def _is_long(self) -> bool:
+        """Whether the grid is not to be made at once, nor kept."""
+        # compared first, sizes that a program leaves open would be bounded in it
+        if self.is_pinned or torch.compiler.is_compiling():
+            return False
+        if math.prod((*self.batch_shape, *self.target.size_for("Warp"))) <= _MOST_KEPT:
+            return False
+        return all(t.is_cpu and not is_unknown(t) for t in self.tensors)
+
+    def ready(self, images: object, mode: str | None, padding: str | None) -> Call | None:
+        """Return the call that an earlier one has left for images of this form, if nothing has changed since."""
+        plan: Plan | None = self._kept.result
+        if plan is None or not plan.calls or not isinstance(images, Tensor):
+            return None
+        mode, padding = self.mode if mode is None else mode, self.padding_mode if padding is None else padding
+        tensors = self.tensors
+        if not is_eager(images, *tensors) or images.requires_grad:
+            return None
+        call = plan.calls.get(self._form_of(images, mode, padding))
+        if call is None or plan.is_pinned:
+            return call
+        learns = images.dtype.is_floating_point and keeps_graph(*tensors)
+        return None if learns or self._kept.entry(tensors, self.form) is None else call
+
+    def _form_of(self, images: Tensor, mode: str, padding: str) -> tuple[object, ...]:
+        return images.shape, images.stride(), images.dtype, mode, padding, self.fill
+
+    def warped(self, images: Tensor, sampler: Sampler) -> Tensor:
+        """Return the warped images (B, C, H', W') of checked images (B, C, H, W)."""
+        route, given = self.route(images), images
+        images = self.lengthened(images)
+        if route == "operator":
+            options = self.tolerance, self.antialias, self._reach(sampler.padding_mode), sampler
+            return operators.warped(images, self.sampled, self.target, self.rotation, *options)
+        if route == "strips":
+            cameras = math.prod(self.batch_shape)
+            result = maker(images, len(images) if cameras == 1 else cameras, self.target.size_for("Warp"))()
+            kept: dict[int, Pyramid] = {}
+            for rows, where in self.strip_positions(sampler.padding_mode):
+                with torch.no_grad():
+                    render(images, where, *sampler, kept, result[:, :, rows])
+            return result
+        plan: Plan | None = self._kept.result
+        where = self.positions(route, sampler.padding_mode)
+        call = prepared(images, where, sampler)
+        if call is None:
+            return by_torch(images, where, sampler)
+        result = call(images)
+        # most warps are used once, and keep no calls
+        is_kept = plan is not None and any(where is each for each in plan.positions.values())
+        if plan is not None and is_kept and images is given and sampler.fill == self.fill:
+            if len(plan.calls) >= _MOST_CALLS:
+                plan.calls.clear()
+            plan.calls[self._form_of(images, sampler.mode, sampler.padding_mode)] = call
         return result
-    plan: Plan | None = warp._kept.result
-    where = positions(warp, route, sampler.padding_mode)
-    call = prepared(images, where, sampler)
-    if call is None:
-        return by_torch(images, where, sampler)
-    result = call(images)
-    # most warps are used once, and keep no calls
-    is_kept = plan is not None and plan.positions.result is where
-    if plan is not None and is_kept and images is given and sampler.fill == warp.fill:
-        plan.calls((), _form(warp, images, sampler.mode, sampler.padding_mode), lambda: call)
-    return result
 
+    def lengthened(self, images: Tensor) -> Tensor:
+        """Return the images that are sampled: those of a whole turn go on beyond their edges."""
+        seam = self.seam
+        return images if seam is None else laid_as(images, seam.around(images))
 
-def lengthened(warp: CameraPair, images: Tensor) -> Tensor:
-    """Return the images that a warp samples: those of a whole turn go on beyond their edges."""
-    return images if warp._seam is None else laid_as(images, warp._seam.around(images))
+    def positions(self, route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
+        """Return the positions at which target pixels sample the source's image, by the route "graph" or "kept"."""
+        if route == "graph":
+            if in_jit_trace():
+                raise RuntimeError(
+                    "Warp: cameras must not learn in torch.jit.trace and torch.onnx.export(dynamo=False); got some "
+                    "that do. Use torch.onnx.export(dynamo=True) or torch.export; or make the map a constant by "
+                    "warp.requires_grad_(False) and one call before"
+                )
+            return self.locate(range(self.target.size_for("Warp")[0]), padding, 0.0)
+        if records_constants() and (constant := self._constant(padding)):
+            return constant
+        reach, tolerance = self._reach(padding), self.tolerance
+        compute = partial(self.computed, reach, tolerance)
+        return self._plan().positions_for(reach if tolerance else "zeros", compute)
 
+    def _plan(self) -> Plan:
+        plan: Plan = self._kept.result
+        return plan if plan is not None and plan.is_pinned else self._kept(self.tensors, self.form, Plan)
 
-def positions(warp: CameraPair, route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
-    """Return the positions at which target pixels sample the source's image, by the route "graph" or "kept"."""
-    if route == "graph":
-        if in_jit_trace():
-            raise RuntimeError(
-                "Warp: cameras must not learn in torch.jit.trace and torch.onnx.export(dynamo=False); got some that "
-                "do. Use torch.onnx.export(dynamo=True) or torch.export; or make the map a constant by "
-                "warp.requires_grad_(False) and one call before"
-            )
-        return warp._locate(range(warp.target.size_for("Warp")[0]), padding, 0.0)
-    if records_constants() and (constant := _constant(warp, padding)):
-        return constant
-    reach = _reach(warp, padding)
-    key = reach if warp.tolerance else "zeros"
-    return _plan_of(warp).positions_for(key, lambda: _computed(warp, reach))
+    def by_pixel(self) -> Sampling:
+        """Return the positions of all pixels, one by one."""
+        return self.positions("graph" if self.route() == "graph" else "kept").pixels
 
+    def computed(self, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
+        """Return the positions of all pixels, without a graph, which serve a padding."""
+        if tolerance:
+            if not self.antialias and (host := self.host) is not None:
+                return host.positions("kept", padding).on(self.target.intrinsics.device)
+            if self._is_operator and self.target.intrinsics.is_cpu:
+                planes, mapped = operators.positions(self.sampled, self.target, self.rotation, tolerance, padding)
+                grid = planes.movedim(1, -1)
+                return Sampling(grid, mapped, local_scale(grid, mapped, self.sampled) if self.antialias else None)
+        return self.locate(range(self.target.size_for("Warp")[0]), padding, tolerance)
 
-def _plan_of(warp: CameraPair) -> Plan:
-    pinned: Plan = warp._kept.result
-    return pinned if warp.is_pinned else warp._kept(warp._inputs(), warp._options, Plan)
+    def strip_positions(self, padding: PaddingMode = "zeros", count: int | None = None) -> Iterator[tuple[slice, Any]]:
+        """Yield rows of the target, `count` at a time, and their positions on the source's image."""
+        height, width = self.target.size_for("Warp")
+        step = count or max(_STRIP // (max(math.prod(self.batch_shape), 1) * width), 1)
+        for top in range(0, height, step):
+            rows = range(top, min(top + step, height))
+            with torch.no_grad():
+                where = self.locate(rows, self._reach(padding), self.tolerance)
+            yield slice(rows.start, rows.stop), where
 
+    def on_image(self, where: Sampling | Lattice) -> Tensor:
+        """Whether the source maps pixels onto its image, (B or 1, 1, h, W')."""
+        grid, source = where.pixels.grid.detach(), self.sampled
+        pixels = (grid + 1) * grid.new_tensor(source.size_for("Warp")[::-1]) / 2 - 0.5
+        return (where.pixels.mapped & source.contains(pixels)).unsqueeze(1)
 
-def by_pixel(warp: CameraPair) -> Sampling:
-    """Return the positions of all pixels, one by one."""
-    return positions(warp, "graph" if route_of(warp) == "graph" else "kept").pixels
+    def _reach(self, padding: PaddingMode) -> PaddingMode:
+        """Return the padding of positions that serve the warp's own padding and this one."""
+        # of equal words compilers know no max by a key
+        return PADDINGS[max(PADDINGS.index(self.padding_mode), PADDINGS.index(padding))]
 
+    def _constant(self, padding: PaddingMode) -> Sampling | Lattice | None:
+        """Return the positions as a constant of an exported program; None if they depend on its inputs."""
+        if not self.is_pinned and not is_constant(self):
+            return None
+        with set_aside() if self.is_pinned else with_values(self):
 
-def _computed(warp: CameraPair, reach: PaddingMode) -> Sampling | Lattice:
-    """Return the positions of all pixels, without a graph, which serve a padding."""
-    if warp.tolerance and not warp.antialias and (host := warp.host) is not None:
-        return positions(host, "kept", reach).on(warp.target.intrinsics.device)
-    if not (_is_operator(warp) and warp.tolerance and warp.target.intrinsics.is_cpu):
-        return warp._locate(range(warp.target.size_for("Warp")[0]), reach, warp.tolerance)
-    planes, mapped = compiled.positions(warp._sampled, warp.target, warp.rotation, warp.tolerance, reach)
-    grid = planes.movedim(1, -1)
-    return Sampling(grid, mapped, local_scale(grid, mapped, warp._sampled) if warp.antialias else None)
+            def own() -> Sampling:
+                where = self.positions("kept", padding).pixels
+                grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
+                return where._replace(grid=grid, mapped=mapped)
 
-
-def strips(
-    warp: CameraPair, padding: PaddingMode = "zeros", count: int | None = None
-) -> Iterator[tuple[slice, Sampling | Lattice]]:
-    """Yield rows of the target, `count` at a time, and their positions on the source's image."""
-    height, width = warp.target.size_for("Warp")
-    step = count or max(_STRIP // (max(math.prod(warp.batch_shape), 1) * width), 1)
-    for top in range(0, height, step):
-        rows = range(top, min(top + step, height))
-        with torch.no_grad():
-            where = warp._locate(rows, _reach(warp, padding), warp.tolerance)
-        yield slice(rows.start, rows.stop), where
-
-
-def in_strips(
-    warp: CameraPair, images: Tensor, count: int | None, sampler: Sampler
-) -> Iterator[tuple[slice, Tensor, Tensor]]:
-    """See `Warp.strips`."""
-    kept: dict[int, Pyramid] = {}
-    images = lengthened(warp, images)
-    for rows, where in strips(warp, sampler.padding_mode, count):
-        with torch.no_grad():
-            part, valid = render(images, where, *sampler, kept), on_image(warp, where)
-        yield rows, part, valid
-
-
-def on_image(warp: CameraPair, where: Sampling | Lattice) -> Tensor:
-    """Whether the source maps pixels onto its image, (B or 1, 1, h, W')."""
-    grid, source = where.pixels.grid.detach(), warp._sampled
-    pixels = (grid + 1) * grid.new_tensor(source.size_for("Warp")[::-1]) / 2 - 0.5
-    return (where.pixels.mapped & source.contains(pixels)).unsqueeze(1)
-
-
-def pin(warp: CameraPair) -> None:
-    """Have a warp keep its positions from now on, with their graph, if they are to be kept at all."""
-    # the operator of compiled code keeps its own; what inference mode makes could not be used in a graph later
-    is_operator = _is_operator(warp) and compiled.takes(warp.target.intrinsics.detach(), warp._inputs())
-    if warp.is_pinned or is_operator or torch.is_inference_mode_enabled():
-        return
-    if keeps_graph(*warp._inputs()):
-        where = positions(warp, "graph")
-    else:
-        where = positions(warp, "kept") if is_exporting() else _computed(warp, warp.padding_mode)
-    warp._kept.renew(lambda: Plan(where, warp.padding_mode))
-
-
-def _reach(warp: CameraPair, padding: PaddingMode) -> PaddingMode:
-    """Return the padding of positions that serve the warp's own padding and this one."""
-    # of equal words compilers know no max by a key
-    return PADDINGS[max(PADDINGS.index(warp.padding_mode), PADDINGS.index(padding))]
-
-
-def _is_operator(warp: CameraPair) -> bool:
-    """Whether code is compiled that calls this warp as one; it knows cameras of one model."""
-    return is_for_here() and warp.is_an_operator and not (warp.source.is_mixed or warp.target.is_mixed)
-
-
-def _is_long(warp: CameraPair) -> bool:
-    """Whether the grid is not to be made at once, nor kept."""
-    # compared first, sizes that a program leaves open would be bounded in it
-    if warp.is_pinned or torch.compiler.is_compiling():
-        return False
-    if math.prod((*warp.batch_shape, *warp.target.size_for("Warp"))) <= _MOST_KEPT:
-        return False
-    return all(t.is_cpu and not is_unknown(t) for t in warp._inputs())
-
-
-def _constant(warp: CameraPair, padding: PaddingMode) -> Sampling | Lattice | None:
-    """Return the positions as a constant of an exported program; None if they depend on its inputs."""
-    if not warp.is_pinned and not is_constant(warp):
-        return None
-    with set_aside() if warp.is_pinned else with_values(warp):
-
-        def own() -> Sampling:
-            where = positions(warp, "kept", padding).pixels
-            grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
-            return where._replace(grid=grid, mapped=mapped)
-
-        plan = _plan_of(warp)
-        return own() if plan.is_pinned else plan.positions_for(f"constant {_reach(warp, padding)}", own)
+            plan = self._plan()
+            return own() if plan.is_pinned else plan.positions_for(f"constant {self._reach(padding)}", own)

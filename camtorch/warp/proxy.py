@@ -37,23 +37,24 @@ class ProxyWarp(Warp):
         """Return 1 / distance to the proxy along unit rays (B, *N, 3) of either camera, and whether they meet it."""
         raise NotImplementedError
 
-    def _inputs(self) -> list[Tensor]:
-        return [*super()._inputs(), self.extrinsics.rotation, self.extrinsics.translation]
+    @property
+    def tensors(self) -> list[Tensor]:
+        return [*super().tensors, self.extrinsics.rotation, self.extrinsics.translation]
 
-    def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
+    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
         if not self.antialias:
             return Sampling(*self._of_rows(rows), None)
-        return scaled_rows(self._sampled, rows, self.target.size_for("Warp")[0], self._of_rows)
+        return scaled_rows(self.sampled, rows, self.target.size_for("Warp")[0], self._of_rows)
 
     def _of_rows(self, rows: range) -> tuple[Tensor, Tensor]:
         pixels = pixels_of_rows(self.target, rows)
         batch = self.batch_shape or (1,)
-        seen, mapped = self._move(pixels.expand(*batch, *pixels.shape), back=True)
-        if self._seam is not None:
-            seen = seen + seen.new_tensor(self._seam.rims[::2])
-        return to_positions(seen, mapped, self._sampled.size_for("Warp")), mapped
+        seen, mapped = self.move(pixels.expand(*batch, *pixels.shape), back=True)
+        if self.seam is not None:
+            seen = seen + seen.new_tensor(self.seam.rims[::2])
+        return to_positions(seen, mapped, self.sampled.size_for("Warp")), mapped
 
-    def _move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
+    def move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         source, target = (self.target, self.source) if back else (self.source, self.target)
         rays, has_ray = source.unproject(pixels)
         # the other camera sees the points that the rays meet in these directions

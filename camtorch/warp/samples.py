@@ -22,8 +22,8 @@ from camtorch.projection.native_calls import Between, Lattices, run_and_follow
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 from camtorch.warp.grid import FEWEST, MOST_KEPT, coarse, kept_probes
-from camtorch.warp.pair import CameraPair
 from camtorch.warp.panorama import goes_round
+from camtorch.warp.plan import CameraPair
 from camtorch.warp.sampling import PADDINGS, SHRINKS, SURELY, Options, Sampler
 
 Label = Literal["pixels", "boxes", "rays", "columns", "pose"]

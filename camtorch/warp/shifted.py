@@ -29,7 +29,7 @@ class ShiftedWarp(Warp):
     """
 
     is_an_operator: ClassVar[bool] = False
-    _seam = None
+    seam = None
     shift: Tensor
     distance: Tensor  # (B, H, W): along the rays of the source; 0 if unknown
 
@@ -78,11 +78,11 @@ class ShiftedWarp(Warp):
         away = _length(rays * length[..., None] - self.shift.to(distance)[:, None, None])
         return torch.where(mapped & (length > 0), away, 0.0)[:, None]
 
-    def _locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
+    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
         seen, mapped = (t[:, rows.start : rows.stop] for t in self._surface())
         return Sampling(to_positions(seen.clone(), mapped, self.source.size_for("Warp")), mapped, None)
 
-    def _move(self, pixels: Any, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
+    def move(self, pixels: Any, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         if back:
             seen, mapped = self._surface()
             u, v = pixels.round().long().unbind(-1)

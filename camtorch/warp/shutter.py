@@ -101,7 +101,7 @@ class RollingShutter(GeometryModule):
         """Return the shutter with the same numbers, which do not learn."""
         return RollingShutter(self.readout.detach(), self.rates.detach(), direction=self.direction)
 
-    def _share(self, pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    def read_at(self, pixels: Tensor, size: tuple[int, int]) -> Tensor:
         """Return when pixels (..., 2) are read, in readouts from the middle one."""
         across = self.direction in ("right", "left")
         share = (pixels[..., 0 if across else 1] + 0.5) / size[1 if across else 0] - 0.5
@@ -259,7 +259,7 @@ class InMotion:
         pixels, _ = as_points(pixels, "pixels", 2, self.batch_shape, self.camera.tensors[:1], "Warp")
         rays, valid = self.camera.unproject(pixels)
         pixels = torch.where(valid.unsqueeze(-1), pixels, 0.0)
-        return self.shutter.turned(rays, self.shutter._share(pixels, self.size), 1.0), valid
+        return self.shutter.turned(rays, self.shutter.read_at(pixels, self.size), 1.0), valid
 
     def project(self, rays: Tensor) -> tuple[Tensor, Tensor]:
         """Return pixels and valid, False if the scene passes as fast as rows are read, or faster."""
@@ -268,7 +268,7 @@ class InMotion:
 
         def seen(share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             pixels, valid = self.camera.project(self.shutter.turned(rays, share, -1.0))
-            return pixels, valid, self.shutter._share(pixels, self.size)
+            return pixels, valid, self.shutter.read_at(pixels, self.size)
 
         with torch.no_grad():
             before = torch.zeros_like(rays[..., 0].detach())

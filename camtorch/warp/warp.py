@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.door import is_exporting, keeps_graph
 from camtorch.poses.rotations import as_rotation, turn
 from camtorch.values.arguments import (
     LEFT,
@@ -25,12 +25,23 @@ from camtorch.values.arguments import (
 )
 from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import typed_as
-from camtorch.warp import plan
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.grid import OUTSIDE
-from camtorch.warp.pair import CameraPair
-from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, Options, PaddingMode, Sampler, as_fill, as_options
+from camtorch.warp.plan import CameraPair, Plan
+from camtorch.warp.sampling import (
+    MODES,
+    PADDINGS,
+    Fill,
+    Mode,
+    Options,
+    PaddingMode,
+    Pyramid,
+    Sampler,
+    as_fill,
+    as_options,
+    render,
+)
 
 
 def as_sized(camera: Camera, name: str, owner: str) -> Camera:
@@ -91,7 +102,6 @@ class Warp(CameraPair):
     fill: tuple[float, ...]
     antialias: bool
     _has_shutters: ClassVar[bool] = False
-    keeps_lens: ClassVar[bool] = False  # True: it can follow another warp, as one warp that `follow` returns
 
     def __init__(
         self,
@@ -119,15 +129,8 @@ class Warp(CameraPair):
         if len(batch) > 1:
             got = ", ".join(map(str, shapes))
             raise ValueError(f"Warp: source, target and rotation must share one batch dim, or have none; got {got}")
-        self._set(source, target, options, batch)
+        self.set_up(source, target, options, batch)
         self.turned_by(rotation)
-
-    @classmethod
-    def unchecked(cls, *given: Any) -> Self:
-        """Return a warp, without a rotation yet, from valid arguments of `_set`."""
-        warp = cls.__new__(cls)
-        warp._set(*given)
-        return warp
 
     def forward(
         self,
@@ -159,7 +162,7 @@ class Warp(CameraPair):
                 colours of a PIL image are a palette's, several come of one, or other integers would be averaged.
             TypeError: If images are none of these kinds, or complex.
         """
-        call: Any = plan.ready(self, images, mode, padding_mode) if fill is None else None
+        call: Any = self.ready(images, mode, padding_mode) if fill is None else None
         made: Any = self._alike(images, mode, padding_mode, fill) if call is None else call(images)
         return made  # type: ignore[no-any-return]  # of the kind of the images
 
@@ -170,18 +173,14 @@ class Warp(CameraPair):
             return warped_alike(images, self.source.size_for("Warp"), "Warp", warp, self.source.intrinsics.device)
         sampler = checked(self, images, mode, padding_mode, fill)
         if images.ndim == 4:
-            return self._warped(images, sampler)
+            return self.warped(images, sampler)
         lead, cameras = images.shape[:-3], math.prod(self.batch_shape)
         if cameras == 1:
             made = self.forward(images[None].flatten(0, -4), mode=mode, padding_mode=padding_mode, fill=fill)
             return made.view(*lead, *made.shape[1:])
         # the frames of a clip are channels for its camera
         each = sampler.fill if len(sampler.fill) == 1 else sampler.fill * math.prod(lead[1:])
-        return self._warped(images.flatten(1, -3), sampler._replace(fill=each)).unflatten(1, images.shape[1:-2])
-
-    def _warped(self, images: Tensor, sampler: Sampler) -> Tensor:
-        """Return the warped images (B, C, H', W') of checked images (B, C, H, W)."""
-        return plan.warped(self, images, sampler)
+        return self.warped(images.flatten(1, -3), sampler._replace(fill=each)).unflatten(1, images.shape[1:-2])
 
     if TYPE_CHECKING:
 
@@ -224,11 +223,19 @@ class Warp(CameraPair):
         rows = None if rows is None else as_whole(rows, "rows", "Warp", least=1)
         if isinstance(images, Tensor) and images.ndim != 4:
             raise ValueError(f"Warp: images must be (B, C, H, W) for strips; got shape {tuple(images.shape)}")
-        return plan.in_strips(self, images, rows, checked(self, images, mode, padding_mode, fill))
+        return self._in_strips(images, rows, checked(self, images, mode, padding_mode, fill))
+
+    def _in_strips(self, images: Tensor, count: int | None, sampler: Sampler) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        kept: dict[int, Pyramid] = {}
+        images = self.lengthened(images)
+        for rows, where in self.strip_positions(sampler.padding_mode, count):
+            with torch.no_grad():
+                part, valid = render(images, where, *sampler, kept), self.on_image(where)
+            yield rows, part, valid
 
     def grid(self) -> Tensor:
         """Return positions (B or 1, H', W', 2) for `grid_sample(..., align_corners=False)`; -9 for none."""
-        where, seam = plan.by_pixel(self), self._seam
+        where, seam = self.by_pixel(), self.seam
         if seam is None:
             return where.grid.clone(memory_format=torch.contiguous_format)
         grid = seam.on_image(where.grid, self.source.size_for("Warp"))
@@ -237,13 +244,23 @@ class Warp(CameraPair):
     def valid_mask(self) -> Tensor:
         """Return (B or 1, 1, H', W') bool: whether the pixel has a ray, and the source sees it on its image."""
         with torch.no_grad():
-            if plan.route_of(self) == "strips":
-                return torch.cat([plan.on_image(self, where) for _, where in plan.strips(self)], 2)
-            return plan.on_image(self, plan.positions(self, "kept"))
+            if self.route() == "strips":
+                return torch.cat([self.on_image(where) for _, where in self.strip_positions()], 2)
+            return self.on_image(self.positions("kept"))
 
     def pin(self) -> Warp:
         """Compute the grid once, with its graph, for a warp whose cameras will not change; return the warp."""
-        plan.pin(self)
+        # the operator of compiled code keeps its own; what inference mode makes could not be used in a graph later
+        is_operator = self.is_called(self.target.intrinsics.detach())
+        if self.is_pinned or is_operator or torch.is_inference_mode_enabled():
+            return self
+        if keeps_graph(*self.tensors):
+            where = self.positions("graph")
+        elif is_exporting():
+            where = self.positions("kept")
+        else:
+            where = self.computed(self.padding_mode, self.tolerance)
+        self._kept.renew(lambda: Plan(where, self.padding_mode))
         return self
 
     def transform_points(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
@@ -253,7 +270,7 @@ class Warp(CameraPair):
             pixels of the same shape, and valid (B, *N) bool: the source pixel has a ray, and the target sees
             it on its image. Pixels off the image keep their place; pixels that cannot be mapped are (-1, -1).
         """
-        return self._move(pixels, on_image=True)
+        return self.move(pixels, on_image=True)
 
     def transform_boxes(self, boxes: Numbers) -> tuple[Tensor, Tensor]:
         """Move boxes (B, *N, 4), or (*N, 4): x1, y1, x2, y2 in pixel-centre coordinates.

@@ -19,7 +19,7 @@ from camtorch.native import sampler
 from camtorch.native.library import _find, library, native_available
 from camtorch.values.dtypes import widen
 from camtorch.warp import grid as positions
-from camtorch.warp import plan, sampling
+from camtorch.warp import sampling
 from camtorch.warp.grid import Lattice, Sampling
 
 MODES = ("nearest", "bilinear", "bicubic")
@@ -316,7 +316,7 @@ def test_no_read_outside_and_nothing_undefined_in_any_variant(fuzzed):
 
 
 def kept(warp):
-    return plan.positions(warp, "kept")
+    return warp.positions("kept")
 
 
 @pytest.mark.usefixtures("each_variant")

@@ -8,17 +8,16 @@ import torch
 from cameras import each_kind, make, real
 
 import camtorch as ct
-from camtorch.warp.plan import by_pixel
 
 TOLERANCES = (0.1, 0.01)
 
 
 def check(source, target, rotation):
     """Positions on the image, or of which one is, differ by no more than the tolerance; mapped are the same."""
-    exact = by_pixel(ct.Warp(source, target, rotation))
+    exact = ct.Warp(source, target, rotation).by_pixel()
     half = torch.tensor(source.image_size[::-1]) / 2
     for tolerance in TOLERANCES:
-        close = by_pixel(ct.Warp(source, target, rotation, tolerance=tolerance))
+        close = ct.Warp(source, target, rotation, tolerance=tolerance).by_pixel()
         assert torch.equal(exact.mapped, close.mapped)
         on_image = (exact.grid.abs() <= 1).all(-1) | (close.grid.abs() <= 1).all(-1)
         error = ((exact.grid - close.grid) * half).norm(dim=-1)[exact.mapped & on_image]

@@ -7,7 +7,6 @@ import torch
 
 import camtorch as ct
 from camtorch.native.library import native_available
-from camtorch.warp.plan import by_pixel
 
 SIZE = (120, 160)
 
@@ -57,7 +56,7 @@ def test_antialias_follows_the_local_scale():
     target = ct.KannalaBrandt([150.0, 150, 79.5, 59.5], [-0.25, 0.0, 0.0, 0.0], image_size=SIZE).requires_grad_(False)
     plain, smooth = (ct.Warp(camera, target, antialias=on) for on in (False, True))
     noise = torch.rand(1, 2, *SIZE)
-    scale = by_pixel(smooth).scale
+    scale = smooth.by_pixel().scale
     seen = smooth.valid_mask().expand(-1, 2, -1, -1)
     grows = (scale <= 1).unsqueeze(1) & seen
     shrinks = (scale > 1.3).unsqueeze(1) & seen
@@ -90,7 +89,7 @@ def test_pixels_without_a_ray_take_the_fill_in_every_padding_mode():
     behind = ct.KannalaBrandt([40.0, 40, 79.5, 59.5], image_size=SIZE).requires_grad_(False)
     for padding_mode in ("zeros", "border", "reflection"):
         warp = ct.Warp(pinhole(), behind, turn(60, 0, 0), padding_mode=padding_mode, fill=7.0)
-        without = ~by_pixel(warp).mapped[0]
+        without = ~warp.by_pixel().mapped[0]
         assert without.any()
         assert (warp(torch.rand(1, 1, *SIZE))[0, 0][without] == 7).all()
 

@@ -256,7 +256,7 @@ def test_a_call_that_is_ready_follows_every_change(change):
     images = 255 * smooth(dtype=torch.float32)
     warp, later = (ct.Warp(fisheye().float(), pinhole().float(), turn(60)).requires_grad_(False) for _ in range(2))
     before = [warp(images) for _ in range(3)][-1]
-    assert warp._kept.result.calls.result is not None or not native_available()
+    assert warp._kept.result.calls or not native_available()
     CHANGES[change](warp)
     CHANGES[change](later)
     after = warp(images)
