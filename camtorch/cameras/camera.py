@@ -393,6 +393,17 @@ class Camera(Freezable, Editable):
         """All tensors that the camera learns, or could: what rooms ask, and users do not."""
         return self.intrinsics, self.distortion
 
+    @property
+    def form(self) -> tuple[object, ...]:
+        """Everything but the tensors: cameras of one form and equal tensors are the same."""
+        return type(self), self.image_size
+
+    def size_for(self, what: str) -> tuple[int, int]:
+        """Return the image_size; raise if it is None."""
+        if self.image_size is None:
+            raise ValueError(f"{type(self).__name__}: image_size must be (height, width) for {what}; got None")
+        return self.image_size
+
     def contains(self, pixels: Numbers) -> Tensor:
         """Whether pixels (..., 2) lie on the image, its outer pixel edges included; bool (...)."""
         return on_image(pixels, self.size_for("contains"), type(self).__name__)
@@ -567,11 +578,12 @@ class Camera(Freezable, Editable):
             *vars(CameraLike),
             *dir(GeometryModule),
             "each",
+            "form",
             "memo_names",
+            "size_for",
             "tensor_names",
             "tensors",
         }
-        inside |= {"memo_names", "tensor_names"}
         inside -= {"distortion_names", "is_mixed", *dir(nn.Module)}
         names: list[str] = super().__dir__()  # type: ignore[no-untyped-call]
         return [n for n in names if n not in inside and (n[:1] != "_" or n[:2] == "__")]

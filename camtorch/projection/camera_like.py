@@ -28,8 +28,15 @@ class CameraLike(ModelSpec, BatchedModule):
         intrinsics: Tensor
         distortion: Tensor
 
+        # what other packages ask of cameras, and users do not: neither `dir` nor the API pages list it
+
         @property
         def tensors(self) -> tuple[Tensor, ...]: ...
+
+        @property
+        def form(self) -> tuple[object, ...]: ...
+
+        def size_for(self, what: str) -> tuple[int, int]: ...
 
         @property
         def K(self) -> Tensor: ...  # noqa: N802
@@ -48,15 +55,3 @@ class CameraLike(ModelSpec, BatchedModule):
         def _evaluate(
             self, direction: Any, rows: Tensor, lead: Any, tensors: Any, cameras_of: Any = None
         ) -> tuple[Tensor, Tensor]: ...
-
-    # what other packages ask of cameras, and users do not: neither `dir` nor the API pages list it
-
-    @property
-    def form(self) -> tuple[object, ...]:
-        """Everything but the tensors: cameras of one form and equal tensors are the same."""
-        return type(self), self.image_size
-
-    def size_for(self, what: str) -> tuple[int, int]:
-        if self.image_size is None:
-            raise ValueError(f"{type(self).__name__}: image_size must be (height, width) for {what}; got None")
-        return self.image_size

@@ -183,6 +183,8 @@ class Lattices:
         """Return `nodes` (C, 2, n + 5, m + 5), `cells`, and `exact` (2, K, 8, 8), NaN if there is no position."""
         (cameras, n, m), dtype, most, step = self.cells.shape, self.nodes.dtype, self._most, structs.STEP
         nodes = self.nodes.as_strided((cameras, 2, n + 5, m + 5), (*self.nodes.stride()[:2], m + 5, 1))
+        if not self.counters[1]:
+            return nodes, self.cells, nodes.new_empty(2, 0, step, step)
         exact = self._room[: 2 * step * step * most * dtype.itemsize].view(dtype).view(2, most, step, step)
         return nodes, self.cells, exact[:, : self.counters[1]].clone()
 
@@ -239,10 +241,13 @@ def run_and_follow(
     """
     threads = min(thread_count(), tiles) if tiles > 1 else 1
     while True:
-        left: list[int] = []
         counters[:] = [0, 0]
-        spread(lambda: left.append(run(call)), threads)  # noqa: B023 (called at once)
-        flags = functools.reduce(operator.or_, left)
+        if threads == 1:
+            flags = run(call)
+        else:
+            left: list[int] = []
+            spread(lambda: left.append(run(call)), threads)  # noqa: B023 (called at once)
+            flags = functools.reduce(operator.or_, left)
         if not flags & (structs.LEFT_FROM | structs.LEFT_TO):
             return flags
         for flag, native in ((structs.LEFT_FROM, start), (structs.LEFT_TO, end)):

@@ -22,9 +22,9 @@ from camtorch.native.library import native_available
 from camtorch.native.sampler import classify
 from camtorch.native.structs import CELL_CUBIC, CELL_DOUBT, CELL_EMPTY, CELL_TODO, POSITIONS, STEP
 from camtorch.poses.rotations import turn
+from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.native_calls import Between
 from camtorch.values.threads import on_one_thread
-from camtorch.warp.moving import between
 from camtorch.warp.panorama import goes_round, lengths, off_poles, within_turn
 
 OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
@@ -193,6 +193,17 @@ def tabulate(
         here = slice(i, i + step)
         grid[:, here], mapped[:, here] = exact(pixels_of_rows(target, rows[here]))
     return grid, mapped
+
+
+def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -> Between | None:
+    """Return the compiled geometry from camera to camera for pixels of the dtype of `like`; None in a graph."""
+    made = compiled_of((start, end), like, *(() if rotation is None else (rotation,)))
+    if made is None:
+        return None
+    (one, other), is_batch = made
+    if rotation is not None:
+        is_batch, rotation = is_batch or rotation.ndim == 3, rotation.to(like.dtype)
+    return Between(one, other, rotation, end.size_for("Warp"), is_batch)
 
 
 def _native(source: Camera, target: Camera, rotation: Tensor | None, like: Tensor) -> Between | None:

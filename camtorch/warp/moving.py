@@ -8,20 +8,8 @@ from torch import Tensor
 from camtorch.cameras.camera import Camera
 from camtorch.native.structs import ON_IMAGE, PIXELS
 from camtorch.poses.rotations import turn
-from camtorch.projection.evaluation import compiled_of
-from camtorch.projection.native_calls import Between
 from camtorch.values.arguments import Numbers
-
-
-def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -> Between | None:
-    """Return the compiled geometry from camera to camera for pixels of the dtype of `like`; None in a graph."""
-    made = compiled_of((start, end), like, *(() if rotation is None else (rotation,)))
-    if made is None:
-        return None
-    (one, other), is_batch = made
-    if rotation is not None:
-        is_batch, rotation = is_batch or rotation.ndim == 3, rotation.to(like.dtype)
-    return Between(one, other, rotation, end.size_for("Warp"), is_batch)
+from camtorch.warp.grid import between
 
 
 def moved_pixels(

@@ -222,13 +222,14 @@ class CameraPair(GeometryModule):
         * "kept": positions without a graph, pinned or kept until an input changes.
         """
         learns = not self.is_pinned and keeps_graph(*self.tensors)
-        if images is not None:
-            learns = learns and images.dtype.is_floating_point
-            if not learns and self.is_called(images):
-                return "operator"
-        if not learns and self._is_long and (images is None or not in_graph(images)):
-            return "strips"
-        return "graph" if learns else "kept"
+        if learns and (images is None or images.dtype.is_floating_point):
+            return "graph"
+        if torch.compiler.is_compiling():  # sizes that a program leaves open would be bounded in it by a comparison
+            return "operator" if images is not None and self.is_called(images) else "kept"
+        if self.is_pinned or math.prod((*self.batch_shape, *self.target.size_for("Warp"))) <= _MOST_KEPT:
+            return "kept"
+        looks = all(t.is_cpu and not is_unknown(t) for t in self.tensors)
+        return "strips" if looks and (images is None or not in_graph(images)) else "kept"
 
     def is_called(self, images: Tensor) -> bool:
         """Whether code is compiled that calls this warp as an operator for images; it knows cameras of one model."""
@@ -237,16 +238,6 @@ class CameraPair(GeometryModule):
     @property
     def _is_operator(self) -> bool:
         return is_for_here() and self.is_an_operator and not (self.source.is_mixed or self.target.is_mixed)
-
-    @property
-    def _is_long(self) -> bool:
-        """Whether the grid is not to be made at once, nor kept."""
-        # compared first, sizes that a program leaves open would be bounded in it
-        if self.is_pinned or torch.compiler.is_compiling():
-            return False
-        if math.prod((*self.batch_shape, *self.target.size_for("Warp"))) <= _MOST_KEPT:
-            return False
-        return all(t.is_cpu and not is_unknown(t) for t in self.tensors)
 
     def ready(self, images: object, mode: str | None, padding: str | None) -> Call | None:
         """Return the call that an earlier one has left for images of this form, if nothing has changed since."""

@@ -116,7 +116,7 @@ class Warp(CameraPair):
         tolerance: float | None = None,
     ):
         options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
-        rotation = as_rotation(rotation, "Warp")
+        rotation = None if rotation is None else as_rotation(rotation, "Warp")
         as_sized(source, "source", "Warp")
         as_sized(target, "target", "Warp")
         check_devices("Warp", source=source.intrinsics, target=target.intrinsics, rotation=rotation)
