@@ -106,25 +106,47 @@ INLINE void cubic_weights(float t, float *w) {
     w[3] = -0.75f * s * t * t;
 }
 
-/* The taps of one axis: the pixels, -1 where there are none, and their weights; 2 or 4 of them */
+INLINE void linear_weights(float t, float *w) {
+    w[1] = t;
+    w[0] = 1 - t;
+}
+
+/* The modes that compute with pixels, in the order of their codes: how many pixels along an axis have a part in a sample,
+   how far they lie from it at most, and their weights by how far the one before the sample is */
+#define COMPUTING(ROW, type)                                                                                           \
+    ROW(type, BILINEAR, 2, 1, linear_weights)                                                                          \
+    ROW(type, BICUBIC, 4, 2, cubic_weights)
+
+#define ONE(type, its, taps, reach, weights) +1
+enum { COMPUTING_MODES = COMPUTING(ONE, ), MOST_TAPS = 4 };
+
+#define FITS(type, its, taps, reach, weights) _Static_assert(taps <= MOST_TAPS, "MOST_TAPS is too small");
+COMPUTING(FITS, )
+
+/* Chosen by comparisons, which compilers resolve if they know the mode, and not looked up */
+#define TAPS(type, its, taps, reach, weights) mode == its ? taps:
+INLINE int taps_along(int mode) { return COMPUTING(TAPS, ) 1; }
+
+#define REACH(type, its, taps, reach, weights) mode == its ? reach:
+INLINE float reach_of(int mode) { return COMPUTING(REACH, ) 1; }
+
+/* The taps of one axis: the pixels, -1 where there are none, and their weights */
 INLINE void taps_of(float x, int64_t side, int mode, int padding, int64_t *at, float *weight) {
-    int k, n = mode == BILINEAR ? 2 : 4;
+    int k;
+    const int n = taps_along(mode);
     int64_t cell;
-    if (mode == BILINEAR) x = padded(x, side, padding);
+    if (n == 2) x = padded(x, side, padding); /* else each pixel is, as torch does */
     /* beyond, floats have no part of a pixel, nor images a pixel */
     if (x < -16777216.0f) x = -16777216.0f;
     if (x > 16777216.0f) x = 16777216.0f;
     cell = (int64_t)floorf(x);
-    if (mode == BILINEAR) {
-        weight[1] = x - (float)cell;
-        weight[0] = 1 - weight[1];
-    } else {
-        cubic_weights(x - (float)cell, weight);
-        cell -= 1;
-    }
+#define WEIGH(type, its, taps, reach, weights)                                                                         \
+    if (mode == its) weights(x - (float)cell, weight);
+    COMPUTING(WEIGH, )
+    cell -= n / 2 - 1;
     for (k = 0; k < n; k++) {
         int64_t i = cell + k;
-        if (mode == BICUBIC && padding != ZEROS && (i < 0 || i >= side)) i = (int64_t)padded((float)i, side, padding);
+        if (n > 2 && padding != ZEROS && (i < 0 || i >= side)) i = (int64_t)padded((float)i, side, padding);
         /* what lies beyond by rounding alone has no weight */
         if (padding != ZEROS && i >= side) i = side - 1;
         at[k] = i >= 0 && i < side ? i : -1;
@@ -133,8 +155,8 @@ INLINE void taps_of(float x, int64_t side, int mode, int padding, int64_t *at, f
 
 /* Those of both axes */
 typedef struct {
-    int64_t columns[4], rows[4];
-    float across[4], down[4];
+    int64_t columns[MOST_TAPS], rows[MOST_TAPS];
+    float across[MOST_TAPS], down[MOST_TAPS];
 } Taps;
 
 /* u and v are not NaN */
@@ -150,7 +172,7 @@ INLINE float sum_of(const Job *job, const char *plane, const Taps *taps, float f
                     float lost_v) {
     const int64_t *strides = job->source_strides, *columns = taps->columns, *rows = taps->rows;
     const float *across = taps->across, *down = taps->down;
-    const int n = mode == BILINEAR ? 2 : 4;
+    const int n = taps_along(mode);
     float sum = 0;
     int i, j;
     for (j = 0; j < n; j++)
@@ -165,7 +187,7 @@ INLINE float sum_of(const Job *job, const char *plane, const Taps *taps, float f
 
 INLINE float sample_at(const Job *job, const char *plane, const Taps *taps, float fill, int type, int mode) {
     const float sum = sum_of(job, plane, taps, fill, type, mode, -1, -1), rounding = 4 * 1.1920929e-7f;
-    if (mode != BICUBIC || type != FLOAT32 || fabsf(sum) <= 3.4028235e38f) return sum;
+    if (taps_along(mode) <= 2 || type != FLOAT32 || fabsf(sum) <= 3.4028235e38f) return sum;
     /* a pixel that is not finite has no part where its weight is but a rounding error */
     return sum_of(job, plane, taps, fill, type, mode, rounding * (float)job->source_width,
                   rounding * (float)job->source_height);
@@ -205,7 +227,7 @@ NOT_INLINE void careful(const Span *span, const float *at_u, const float *at_v, 
         int shows = u == u && v == v;
         if (done >> i & 1) continue;
         if (shows && job->padding == ZEROS) {
-            const float reach = mode == BICUBIC ? 2 : 1;
+            const float reach = reach_of(mode);
             shows = u > -reach && v > -reach && u < (float)job->source_width - 1 + reach &&
                     v < (float)job->source_height - 1 + reach;
         }
@@ -572,7 +594,7 @@ INLINE void nearest8(const Span *span, V8 u, V8 v, int type) {
 
 /* Whether eight pixels lie beyond what zeros reach, or have no position */
 INLINE int shows_nothing(const Job *job, V8 u, V8 v, int mode) {
-    const float reach = job->padding != ZEROS ? INFINITY : mode == BICUBIC ? 2 : 1;
+    const float reach = job->padding != ZEROS ? INFINITY : reach_of(mode);
     const V8 low = every8(-reach);
     const V8 right = every8((float)(job->source_width - 1) + reach);
     const V8 below = every8((float)(job->source_height - 1) + reach);
@@ -1478,7 +1500,7 @@ INLINE void chunk(Span *span, char *first, Chunk *at, int64_t n, int type, int m
     const Job *job = span->job;
     const int64_t step = job->result_strides[3] * size_of(type);
     int64_t end = (n + STEP - 1) / STEP * STEP;
-    if (job->padding != ZEROS && mode != BICUBIC) {
+    if (job->padding != ZEROS && taps_along(mode) <= 2) {
         pad(at->u, n, job->source_width, job->padding, type);
         pad(at->v, n, job->source_height, job->padding, type);
     }
@@ -1546,34 +1568,33 @@ typedef void (*Tile)(const Job *, int64_t, int64_t, int64_t);
     NOT_INLINE void NAME(type, mode, layout)(const Job *job, int64_t b, int64_t from, int64_t to) {                    \
         tile(job, b, from, to, type, mode, layout);                                                                    \
     }
-#define INTERPOLATED(type)                                                                                             \
-    MADE(type, BILINEAR, PLANES)                                                                                       \
-    MADE(type, BILINEAR, INTERLEAVED)                                                                                  \
-    MADE(type, BILINEAR, SCATTERED)                                                                                    \
-    MADE(type, BICUBIC, PLANES)                                                                                        \
-    MADE(type, BICUBIC, SCATTERED)
-INTERPOLATED(UINT8)
-INTERPOLATED(BOOL)
-INTERPOLATED(UINT16)
-INTERPOLATED(FLOAT32)
+#define COMPUTED(type, mode, taps, reach, weights)                                                                     \
+    MADE(type, mode, PLANES)                                                                                           \
+    MADE(type, mode, INTERLEAVED)                                                                                      \
+    MADE(type, mode, SCATTERED)
+COMPUTING(COMPUTED, UINT8)
+COMPUTING(COMPUTED, BOOL)
+COMPUTING(COMPUTED, UINT16)
+COMPUTING(COMPUTED, FLOAT32)
 MADE(BYTES1, NEAREST, SCATTERED)
 MADE(BYTES2, NEAREST, SCATTERED)
 MADE(BYTES4, NEAREST, SCATTERED)
 MADE(BYTES8, NEAREST, SCATTERED)
 
-#define WAYS(type)                                                                                                     \
-    {                                                                                                                  \
-        {NAME(type, BILINEAR, PLANES), NAME(type, BILINEAR, INTERLEAVED), NAME(type, BILINEAR, SCATTERED)}, {          \
-            NAME(type, BICUBIC, PLANES), NAME(type, BICUBIC, SCATTERED), NAME(type, BICUBIC, SCATTERED)                \
-        }                                                                                                              \
-    }
-static const Tile interpolated[][2][3] = {WAYS(UINT8), WAYS(BOOL), WAYS(UINT16), WAYS(FLOAT32)};
+#define BY_LAYOUT(type, mode, taps, reach, weights)                                                                    \
+    {NAME(type, mode, PLANES), NAME(type, mode, INTERLEAVED), NAME(type, mode, SCATTERED)},
+static const Tile computed[][COMPUTING_MODES][3] = {
+    {COMPUTING(BY_LAYOUT, UINT8)},
+    {COMPUTING(BY_LAYOUT, BOOL)},
+    {COMPUTING(BY_LAYOUT, UINT16)},
+    {COMPUTING(BY_LAYOUT, FLOAT32)},
+};
 static const Tile moved[] = {NAME(BYTES1, NEAREST, SCATTERED), NAME(BYTES2, NEAREST, SCATTERED),
                              NAME(BYTES4, NEAREST, SCATTERED), NAME(BYTES8, NEAREST, SCATTERED)};
 
 static Tile way_of(const Job *job) {
     if (job->mode == NEAREST) return moved[job->type - BYTES1];
-    return interpolated[job->type][job->mode - BILINEAR][layout_of(job)];
+    return computed[job->type][job->mode - BILINEAR][layout_of(job)];
 }
 
 /* One image as a whole */

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,7 +15,23 @@ from camtorch.native.library import loaded
 from camtorch.values.dtypes import as_pixels
 from camtorch.values.threads import spread, thread_count
 
-_MODES = {"nearest": structs.NEAREST, "bilinear": structs.BILINEAR, "bicubic": structs.BICUBIC}
+Mode = Literal["nearest", "bilinear", "bicubic"]
+
+
+class ModeOfSampling(NamedTuple):
+    """A row of `MODES`."""
+
+    code: int  # of the compiled sampler; -1 if torch alone has the mode
+    code_of_torch: int  # of its `grid_sampler_2d_backward`
+    reach: int  # pixels to either side of a position that have a part in a sample
+    reads_interleaved: bool = False  # whether compiled code reads 3 or 4 channels side by side as vectors
+
+
+MODES: dict[Mode, ModeOfSampling] = {
+    "nearest": ModeOfSampling(structs.NEAREST, 1, 1),
+    "bilinear": ModeOfSampling(structs.BILINEAR, 0, 1, True),
+    "bicubic": ModeOfSampling(structs.BICUBIC, 2, 2),
+}
 PADDINGS = {"zeros": structs.ZEROS, "border": structs.BORDER, "reflection": structs.REFLECTION}
 _TYPES = {torch.uint8: structs.UINT8, torch.bool: structs.BOOL, torch.uint16: structs.UINT16}
 _TYPES[torch.float32] = structs.FLOAT32
@@ -23,9 +40,9 @@ _TILE = 1 << 15  # pixels of a tile, some 0.1 ms a channel
 _WORTH = 8  # pixels that may be copied for one that is made: interpolated one by one they would take longer
 
 
-def takes(dtype: torch.dtype, mode: str) -> bool:
+def takes(dtype: torch.dtype, mode: Mode) -> bool:
     """Whether the library, if it is built, samples images of a dtype so."""
-    return mode == "nearest" or dtype in _TYPES
+    return (mode == "nearest" or dtype in _TYPES) and MODES[mode].code >= 0
 
 
 class Call:
@@ -44,7 +61,7 @@ class Call:
         self,
         images: Tensor,
         size: tuple[int, int],
-        mode: str,
+        mode: Mode,
         padding: str,
         fill: Sequence[float],
         *,
@@ -107,7 +124,7 @@ def _copied(images: Tensor, layout: torch.memory_format) -> Tensor:
     return source.clone(memory_format=layout).expand(images.shape)
 
 
-def describe(job: structs.Job, images: Tensor, result: Tensor, mode: str, padding: str, fill: Sequence[float]) -> None:
+def describe(job: structs.Job, images: Tensor, result: Tensor, mode: Mode, padding: str, fill: Sequence[float]) -> None:
     """Write into a job what arguments of `Call` have in common: all but images and positions."""
     job.source_strides[:], job.result_strides[:] = images.stride(), result.stride()
     job.count, job.channels, job.height, job.width = result.shape
@@ -116,7 +133,7 @@ def describe(job: structs.Job, images: Tensor, result: Tensor, mode: str, paddin
     job.hold(owners)
     job.fill, job.fill_elements = fills.data_ptr(), elements.data_ptr()
     job.type = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
-    job.mode, job.padding, job.tile_rows = _MODES[mode], PADDINGS[padding], _tile_rows(result.shape[3])
+    job.mode, job.padding, job.tile_rows = MODES[mode].code, PADDINGS[padding], _tile_rows(result.shape[3])
 
 
 def _tile_rows(width: int) -> int:
@@ -129,7 +146,7 @@ def tiles_of(result: Tensor) -> int:
     return -(-height // _tile_rows(width)) * count
 
 
-def is_quick(images: Tensor, result: Tensor, mode: str) -> bool:
+def is_quick(images: Tensor, result: Tensor, mode: Mode) -> bool:
     """Whether samples go by vectors: pixels that lie neither in planes nor side by side would go one by one."""
     steps, made = images.stride(), result.stride()
     return (
@@ -139,9 +156,9 @@ def is_quick(images: Tensor, result: Tensor, mode: str) -> bool:
     )
 
 
-def _are_together(result: Tensor, mode: str) -> bool:
+def _are_together(result: Tensor, mode: Mode) -> bool:
     channels = result.shape[1]
-    return mode == "bilinear" and channels in (3, 4) and result.stride()[1::2] == (1, channels)
+    return MODES[mode].reads_interleaved and channels in (3, 4) and result.stride()[1::2] == (1, channels)
 
 
 def _shared(tensor: Tensor) -> int:

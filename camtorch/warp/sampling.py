@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypedDict, get_args
+from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict, get_args
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -20,15 +20,14 @@ from camtorch.values.dtypes import SIGNED, as_pixels, narrow, wide_dtype, widen
 from camtorch.values.threads import thread_count
 from camtorch.warp.grid import Lattice, Sampling
 
-Mode = Literal["nearest", "bilinear", "bicubic"]
+Mode: TypeAlias = sampler.Mode
 PaddingMode = Literal["zeros", "border", "reflection"]
 Fill = float | Sequence[float]
-MODES: tuple[Mode, ...] = get_args(Mode)
+MODES = tuple(sampler.MODES)
 PADDINGS: tuple[PaddingMode, ...] = get_args(PaddingMode)
 
 SHRINKS = 1.5  # pixels of the image to one of the result, from which on edits antialias by themselves
 SURELY = 0.999  # of that: whatever rounding does, less does not
-_REACH = {"nearest": 1, "bilinear": 1, "bicubic": 2}  # pixels to either side of a position that have a part in it
 _LARGE = 1 << 23  # numbers in an image whose copy in float32 leaves every cache
 _TILE = 512  # pixels along the sides of what is then sampled at a time
 _TRACED_LEVELS = 4  # where the values that decide cannot be looked at: down to a sixteenth
@@ -172,7 +171,7 @@ def _render_tiles(result: Tensor, levels: Pyramid, where: Sampling, how: Sampler
 
 def _read(images: Tensor, where: Sampling, how: Sampler) -> tuple[Tensor, Tensor]:
     """Return the part of the images that is read, as of `widen`, and the positions on it; padding stays as it is."""
-    reach, slices, axes = _REACH[how.mode], [], []
+    reach, slices, axes = sampler.MODES[how.mode].reach, [], []
     sides, planes = images.shape[:-3:-1], where.grid.unbind(-1)
     ranges = [[float(end) for end in torch.aminmax(plane)] for plane in planes]
     if any(low < -1 or high > 1 for low, high in ranges):
@@ -424,7 +423,7 @@ class _Sample(torch.autograd.Function):
 
 def _backward(gradient: Tensor, images: Tensor, grid: Tensor, ctx: Any, wanted: tuple[bool, ...]) -> tuple[Tensor, ...]:
     """Return the derivatives of grid_sample by images and positions."""
-    mode, padding = {"bilinear": 0, "nearest": 1, "bicubic": 2}[ctx.mode], PADDINGS.index(ctx.padding_mode)
+    mode, padding = sampler.MODES[ctx.mode].code_of_torch, PADDINGS.index(ctx.padding_mode)
     derivatives: tuple[Tensor, ...] = torch.ops.aten.grid_sampler_2d_backward(
         gradient, images, grid, mode, padding, False, wanted
     )

@@ -139,7 +139,7 @@ def test_the_places_are_there():
     for file, name in places:
         assert (ROOT / file).exists(), file
         text = (ROOT / file).read_text() if name else ""
-        made = rf"^(?:(?:def|class) {name}\b|{name}\b.*=|static .*\bT\({name}\)\()|^(?:from|import) .*\b{name}\b"
+        made = rf"^(?:(?:def|class|#define) {name}\b|{name}\b.*=|static .*\bT\({name}\)\(|(?:from|import) .*\b{name}\b)"
         assert not name or re.search(made, text, re.M), f"{file} has no {name}"
 
 

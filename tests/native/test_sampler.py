@@ -21,9 +21,8 @@ from camtorch.values.dtypes import widen
 from camtorch.warp import grid as positions
 from camtorch.warp import sampling
 from camtorch.warp.grid import Lattice, Sampling
+from camtorch.warp.sampling import MODES, PADDINGS
 
-MODES = ("nearest", "bilinear", "bicubic")
-PADDINGS = ("zeros", "border", "reflection")
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 INTEGERS = (torch.bool, torch.uint8, torch.int8, torch.uint16, torch.int16, torch.int32, torch.int64)
 

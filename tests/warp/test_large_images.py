@@ -25,8 +25,8 @@ def images(dtype, count=1):
     ("mode", "padding_mode", "dtype"),
     [
         (mode, padding_mode, (torch.uint8, torch.float16, torch.uint16 if i else torch.int32)[(i + j) % 3])
-        for i, mode in enumerate(("nearest", "bilinear", "bicubic"))
-        for j, padding_mode in enumerate(("zeros", "border", "reflection"))
+        for i, mode in enumerate(sampling.MODES)
+        for j, padding_mode in enumerate(sampling.PADDINGS)
     ],
 )
 def test_tiles_of_a_large_image_change_nothing(dtype, mode, padding_mode, monkeypatch):
