@@ -19,7 +19,7 @@ from camtorch.native.sampler import maker
 from camtorch.native.structs import STEP
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
-from camtorch.warp import operators
+from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, coarse, straight_lattice
 from camtorch.warp.moving import placed
 from camtorch.warp.panorama import lengths
@@ -69,7 +69,7 @@ class MirrorWarp(Warp):
             options = None if self._decides else self.antialias, sampler.padding_mode, sampler
             cameras = self.source, self.target, self.rotation
             matrix = None if self.map is None else as_tensor(self.map)
-            return operators.warped(images, *cameras, self.tolerance, *options, matrix, _edited)
+            return compiled.warped(images, *cameras, self.tolerance, *options, matrix, _edited)
         route = self.route(images)
         ways = None if in_transform() else self._ways(sampler, smooth, route)
         if not ways:
@@ -294,18 +294,18 @@ def _halvings(where: Sampling | Lattice, source: Camera) -> list[int]:
     return [_halved(scale) for scale in (total / (count.clamp(min=1) * step)).tolist()]
 
 
-@opaque(operators.warp_shapes)
+@opaque(compiled.warp_shapes)
 def _edited(
     images: Tensor, source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, *options: Any
 ) -> tuple[Tensor]:
-    """Return the images of an edit, made in the way that its values choose; see `operators.warped` for the options."""
+    """Return the images of an edit, made in the way that its values choose; see `compiled.warped` for the options."""
     antialias, _, mode, padding_mode, fill, matrix, is_last = options
     how: Any = {"mode": mode, "padding_mode": padding_mode, "fill": ast.literal_eval(f"({fill},)")}
     how |= {"antialias": ast.literal_eval(antialias), "tolerance": tolerance}
     warp: Warp = MirrorWarp(source, target, rotation, **how)
     if matrix is not None:
         warp = AffineWarp(source, target, matrix, rotation, **how)
-    return (operators.laid(warp(images), is_last),)
+    return (compiled.laid(warp(images), is_last),)
 
 
 def as_tensor(matrix: Map) -> Tensor:

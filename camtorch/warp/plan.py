@@ -33,7 +33,7 @@ from camtorch.evaluate.tensors import is_unknown
 from camtorch.native.sampler import Call, maker
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
-from camtorch.warp import operators
+from camtorch.warp import compiled
 from camtorch.warp.grid import Lattice, Sampling, local_scale, locate
 from camtorch.warp.moving import moved_pixels
 from camtorch.warp.panorama import Seam, seam_of
@@ -233,7 +233,7 @@ class CameraPair(GeometryModule):
 
     def is_called(self, images: Tensor) -> bool:
         """Whether code is compiled that calls this warp as an operator for images; it knows cameras of one model."""
-        return self._is_operator and operators.takes(images, self.tensors)
+        return self._is_operator and compiled.takes(images, self.tensors)
 
     @property
     def _is_operator(self) -> bool:
@@ -263,7 +263,7 @@ class CameraPair(GeometryModule):
         images = self.lengthened(images)
         if route == "operator":
             options = self.tolerance, self.antialias, self._reach(sampler.padding_mode), sampler
-            return operators.warped(images, self.sampled, self.target, self.rotation, *options)
+            return compiled.warped(images, self.sampled, self.target, self.rotation, *options)
         if route == "strips":
             cameras = math.prod(self.batch_shape)
             result = maker(images, len(images) if cameras == 1 else cameras, self.target.size_for("Warp"))()
@@ -321,7 +321,7 @@ class CameraPair(GeometryModule):
             if not self.antialias and (host := self.host) is not None:
                 return host.positions("kept", padding).on(self.target.intrinsics.device)
             if self._is_operator and self.target.intrinsics.is_cpu:
-                planes, mapped = operators.positions(self.sampled, self.target, self.rotation, tolerance, padding)
+                planes, mapped = compiled.positions(self.sampled, self.target, self.rotation, tolerance, padding)
                 grid = planes.movedim(1, -1)
                 return Sampling(grid, mapped, local_scale(grid, mapped, self.sampled) if self.antialias else None)
         return self.locate(range(self.target.size_for("Warp")[0]), padding, tolerance)

@@ -8,6 +8,7 @@ from cameras import RANGES, STATED
 from rigs import MANIFEST, load
 
 import camtorch as ct
+from camtorch.cameras import operators
 from camtorch.maps import formats as maps
 from camtorch.values.stub import listed_names
 from camtorch.viewer.viewer import models
@@ -73,3 +74,10 @@ def test_every_class_is_in_the_laws(base, file):
     names = {kind.__name__ for kind in classes(getattr(ct.augment, base))} - {"Edit", "CameraDrawer"}
     assert len(names) > 5
     assert sorted(name for name in names if not re.search(rf"A\.{name}\b", text)) == [], f"{file} lacks them"
+
+
+def test_operators_keep_the_names_that_saved_programs_have():
+    kept = {"camtorch.warp.compiled.positions", "camtorch.warp.compiled._warp", "camtorch.warp.affine._edited"}
+    kept |= {"camtorch.lenses.drawing._drawn"}
+    for name in kept:
+        assert operators._FUNCTIONS[name], name  # imports the module if nobody has

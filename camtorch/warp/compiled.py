@@ -1,4 +1,7 @@
-"""Operators that compiled code calls instead of tracing: a warp of images, and sampling positions with a tolerance."""
+"""Operators that compiled code calls instead of tracing: a warp of images, and sampling positions with a tolerance.
+
+Exported programs know them by the name of this module.
+"""
 
 from __future__ import annotations
 
