@@ -188,6 +188,26 @@ def one(key):
     return list(real(key).values())[-1]
 
 
+SIZE = (48, 64)
+
+
+def fisheye(size=SIZE, focal=0.375, dtype=torch.float32):
+    """A fixed camera, its principal point a little beside the middle; `focal` is in widths of the image."""
+    height, width = size
+    numbers = [focal * width, 1.02 * focal * width, width / 2 - 1, height / 2 - 1], [0.02, -0.01, 0.004, -0.001]
+    return ct.KannalaBrandt(*(torch.tensor(n, dtype=dtype) for n in numbers), image_size=size).requires_grad_(False)
+
+
+def pinhole(size=SIZE, focal=30.0, dtype=torch.float32):
+    """A fixed camera, its principal point in the middle; `focal` is in pixels."""
+    numbers = torch.tensor([focal, focal, (size[1] - 1) / 2, (size[0] - 1) / 2], dtype=dtype)
+    return ct.Pinhole(numbers, image_size=size).requires_grad_(False)
+
+
+def turn(yaw=0.0, pitch=0.0, roll=0.0, dtype=torch.float32):
+    return ct.augment.mount_rotation(*torch.tensor([yaw, pitch, roll], dtype=dtype))
+
+
 # Every model with some of the others: all pairs would be too many
 PAIRS = [(key, KEYS[(i + step) % len(KEYS)]) for i, key in enumerate(KEYS) for step in (1, 0, 6)]
 REAL = [(key, name) for key in KEYS for name in real(key)]

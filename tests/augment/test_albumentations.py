@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from cameras import SIZE, fisheye
 
 import camtorch as ct
 
@@ -11,15 +12,9 @@ A = pytest.importorskip("albumentations", reason="albumentations is not installe
 import camtorch.augment.albumentations  # noqa: E402
 import camtorch.augment.numpy  # noqa: E402
 
-SIZE = (48, 64)
-
-
-def camera():
-    return ct.KannalaBrandt([36.0, 36.0, 31.0, 23.0], [0.01, -0.02, 0.0, 0.0], image_size=SIZE).requires_grad_(False)
-
 
 def transform(**options):
-    return ct.augment.albumentations.Transform(ct.augment.RandomCamera(yaw=8, pitch=8, roll=15, **options), camera())
+    return ct.augment.albumentations.Transform(ct.augment.RandomCamera(yaw=8, pitch=8, roll=15, **options), fisheye())
 
 
 def compose(*transforms, seed=3, **options):
@@ -68,7 +63,7 @@ def test_p_and_chains_of_cameras():
     assert len(compose(transform())(**sample() | none)["bboxes"]) == 0
     never = compose(transform(p=0))(**sample())
     np.testing.assert_array_equal(never["image"], sample()["image"])
-    assert torch.equal(never["camera"].intrinsics, camera().intrinsics)
+    assert torch.equal(never["camera"].intrinsics, fisheye().intrinsics)
     first, second = transform(), transform(image_size=(24, 32))
     out = compose(first, A.RandomBrightnessContrast(p=1), second)(**sample())
     assert out["image"].shape == (24, 32, 3)

@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 import torch
-from cameras import DISTINCT, KEYS, PAIRS, default_dtype_of_double, slow_unless, spread
+from cameras import DISTINCT, KEYS, PAIRS, default_dtype_of_double, pinhole, slow_unless, spread
 
 import camtorch as ct
 from camtorch.augment import PRESETS, RandomCamera, RandomLens, RandomMount
@@ -23,11 +23,6 @@ def source(key):
     camera = spread(key, torch.float32).requires_grad_(False).resize(*SIZE)
     camera.intrinsics[:2] *= 1.6
     return camera
-
-
-def pinhole(dtype=torch.float32, focal=250.0, size=SIZE):
-    intrinsics = torch.tensor([focal, focal, (size[1] - 1) / 2, (size[0] - 1) / 2], dtype=dtype)
-    return ct.Pinhole(intrinsics, image_size=size).requires_grad_(False)
 
 
 def lattice(rows=4, columns=5, size=SIZE):
@@ -104,7 +99,7 @@ def test_every_field_moves_together_between_any_two_models(key, which):
 def test_signs_of_the_angles(angle, moves):
     """Turning right moves the image left, looking up moves it down, leaning right turns it counterclockwise."""
     still, ten = dict.fromkeys(("yaw", "pitch", "roll"), (0, 0)), math.radians(10)
-    augmentation = RandomMount(camera=pinhole(), **{**still, angle: (10, 10)})
+    augmentation = RandomMount(camera=pinhole(SIZE, 250.0), **{**still, angle: (10, 10)})
     centre = (torch.tensor(SIZE[::-1]) - 1) / 2
     pixel = centre if moves else centre + torch.tensor([100.0, 0.0])
     shift = augmentation(keypoints=pixel[None])["keypoints"][0] - pixel
@@ -139,7 +134,7 @@ def sample(count=3, camera=None):
         "depth": rand(count, 1, 60, 80) + 1,
         "label": torch.arange(count),
         "name": [f"{i}.png" for i in range(count)],
-        "camera": pinhole(focal=60.0, size=(60, 80)) if camera is None else camera,
+        "camera": pinhole((60, 80), 60.0) if camera is None else camera,
     }
 
 
@@ -275,7 +270,7 @@ def test_jittered_lenses_stay_invertible_and_bounded():
 
 def test_a_family_has_the_field_of_view_that_is_asked_for():
     for key, degrees in {"kannala_brandt": 130, "pinhole": 100, "equirectangular": 200, "fisheye62": 150}.items():
-        lens = RandomLens(key, fov=degrees, focal=None, centre=None, distortion=None, camera=pinhole())
+        lens = RandomLens(key, fov=degrees, focal=None, centre=None, distortion=None, camera=pinhole(SIZE, 250.0))
         target = lens.change(None, lens.draw(1)).target
         ends = torch.tensor([[-0.5, (SIZE[0] - 1) / 2], [SIZE[1] - 0.5, (SIZE[0] - 1) / 2]])
         left, right = target.unproject(ends.expand(1, -1, -1))[0][0]
@@ -296,7 +291,7 @@ def test_presets_show_what_they_say():
 
 
 def test_output_size_and_light():
-    camera = pinhole()
+    camera = pinhole(SIZE, 250.0)
     out = RandomCamera(
         "webcam", camera=camera, image_size=(60, 90), vignetting=0.6, centre=(0, 0), yaw=0, pitch=0, roll=0
     )(image=torch.ones(1, 3, *SIZE), keypoints=lattice()[None])
@@ -310,7 +305,7 @@ def test_output_size_and_light():
 
 
 def test_chromatic_aberration_scales_red_and_blue():
-    camera = pinhole()
+    camera = pinhole(SIZE, 250.0)
     pixels = lattice()[[0, 4, 15, 19]]
     images = discs(pixels)[:, None].expand(-1, 3, -1, -1)
     lens = RandomLens(camera=camera, focal=None, centre=None, distortion=None, chromatic=(0.01, 0.02))

@@ -1,18 +1,16 @@
 """Augmentations whose camera turns while it takes its image, and whose lens darkens the rim."""
 
 import copy
+from functools import partial
 
 import pytest
 import torch
+from cameras import pinhole
 
 import camtorch as ct
 from camtorch.augment import RandomMount, RandomShutter
 
-
-def camera(size=(120, 160)):
-    return ct.Pinhole.from_fov(80, image_size=size).requires_grad_(False)
-
-
+camera = partial(pinhole, (120, 160), 95.0)
 STILL = {"yaw": None, "pitch": None, "roll": None, "zoom": None}
 
 

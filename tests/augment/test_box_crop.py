@@ -1,17 +1,19 @@
 """Cameras that look at boxes: `ct.views.look_at`, and `BoxCrop`, which moves whole samples by it."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from cameras import every_model, one
+from cameras import every_model, fisheye, one
 
 import camtorch as ct
 import camtorch.augment.kornia
 import camtorch.augment.numpy
 
 SIZE = (160, 120)
+wide = partial(fisheye, (480, 640), 0.3125)
 
 
 def boxes_of(camera, count, seed=0):
@@ -21,12 +23,6 @@ def boxes_of(camera, count, seed=0):
     middle = torch.rand(count, 2, generator=generator, dtype=torch.float64) * (sides - 1)
     half = (0.01 + 0.12 * torch.rand(count, 2, generator=generator, dtype=torch.float64)) * sides
     return torch.cat((middle - half, middle + half), -1)
-
-
-def fisheye(dtype=torch.float32):
-    numbers = [200.0, 205.0, 321.0, 238.0], [0.01, -0.002, 0.001, 0.0003]
-    camera = ct.KannalaBrandt(*(torch.tensor(n, dtype=dtype) for n in numbers), image_size=(480, 640))
-    return camera.requires_grad_(False)
 
 
 @every_model
@@ -73,7 +69,7 @@ def test_the_axis_is_the_middle_and_the_outline_touches_a_side(key):
 )
 def test_boxes_that_are_none_are_refused(boxes, message):
     with pytest.raises(ValueError, match=message):
-        ct.views.look_at(fisheye(), boxes, SIZE)
+        ct.views.look_at(wide(), boxes, SIZE)
 
 
 def test_a_box_seen_straight_up_has_no_way_up():
@@ -84,7 +80,7 @@ def test_a_box_seen_straight_up_has_no_way_up():
 
 
 def test_single_boxes_and_batches():
-    camera = fisheye()
+    camera = wide()
     assert ct.views.look_at(camera, (10, 10, 60, 90), SIZE).rotation.shape == (3, 3)
     boxes = boxes_of(camera, 3).numpy()
     warp = ct.views.look_at(camera, boxes, SIZE)
@@ -104,7 +100,7 @@ def sample_of(camera, count=3):
 
 
 def test_labels_move_with_the_crop_and_back():
-    camera = fisheye(torch.float64)
+    camera = wide(dtype=torch.float64)
     crop = ct.augment.BoxCrop(SIZE, index=-1, margin=0.1, yaw=4, pitch=4, roll=9, zoom=(0.9, 1.1), camera=camera)
     sample = sample_of(camera)
     torch.manual_seed(0)
@@ -122,7 +118,7 @@ def test_labels_move_with_the_crop_and_back():
 
 
 def test_in_a_chain_the_box_moves_with_what_comes_before():
-    camera, A = fisheye(torch.float64), ct.augment  # noqa: N806
+    camera, A = wide(dtype=torch.float64), ct.augment  # noqa: N806
     sample, crop, flip = sample_of(camera), A.BoxCrop(SIZE, index=1), A.HorizontalFlip(p=1)
     mount, away = (A.RandomMount(yaw=(yaw, yaw), pitch=None, roll=None, min_filled=0) for yaw in (20, 95))
     want = flip(crop(mount(sample, camera=camera)))
@@ -138,7 +134,7 @@ def test_in_a_chain_the_box_moves_with_what_comes_before():
 
 def test_samples_without_the_box_are_refused():
     image, boxes = torch.zeros(2, 1, 480, 640), [torch.tensor([[1.0, 1, 9, 9]]), torch.empty(0, 4)]
-    crop = ct.augment.BoxCrop(SIZE, camera=fisheye())
+    crop = ct.augment.BoxCrop(SIZE, camera=wide())
     for call, text in (
         (lambda: crop(image=image), "must have boxes"),
         (lambda: crop(image=image, boxes=boxes), "sample 1 must have a box of index 0; got 0 boxes"),
@@ -150,7 +146,7 @@ def test_samples_without_the_box_are_refused():
 
 
 def test_kornia_crops_the_same():
-    camera, kornia, images = fisheye(), ct.augment.kornia, torch.rand(1, 3, 480, 640)
+    camera, kornia, images = wide(), ct.augment.kornia, torch.rand(1, 3, 480, 640)
     boxes = sample_of(camera)["boxes"][1].float()
     aug = kornia.BoxCrop(camera, SIZE)
     params = aug.forward_parameters(images.shape)

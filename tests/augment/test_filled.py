@@ -13,8 +13,7 @@ SIZE = (120, 160)
 
 
 def pinhole(degrees=70.0):
-    focal = SIZE[1] / 2 / torch.tensor(degrees / 2).deg2rad().tan().item()
-    return ct.Pinhole([focal, focal, (SIZE[1] - 1) / 2, (SIZE[0] - 1) / 2], image_size=SIZE).requires_grad_(False)
+    return ct.Pinhole.from_fov(degrees, image_size=SIZE).requires_grad_(False)
 
 
 def shares(augmentation, count=24, seed=0, **fields):

@@ -1,24 +1,16 @@
 """Which labels are still on the image, where each framework's users look for it."""
 
 import copy
-import importlib
 import pickle
 
 import kornia.augmentation as K  # noqa: N812
-import pytest
 import torch
-from torchvision_stand_in import torchvision_of
+from cameras import SIZE, fisheye
 
 import camtorch as ct
 import camtorch.augment.kornia
 
-SIZE = (48, 64)
 POINTS = torch.tensor([[31.5, 23.5], [2.0, 2.0], [30.0, 20.0], [-30.0, 5.0]])
-
-
-def fisheye():
-    """Of a wide view; a narrow camera sees the middle of it alone."""
-    return ct.KannalaBrandt([22.0, 22.0, 31.5, 23.5], [0.0] * 4, image_size=SIZE).requires_grad_(False)
 
 
 def narrow(**options):
@@ -55,12 +47,6 @@ def test_what_one_augmentation_lost_the_next_ones_do_not_find():
     _, moved = seq(torch.rand(1, 1, *SIZE), POINTS[None, :1])
     assert moved.tolist() == [[[-1, -1]]]
     assert not any(aug.keypoints_valid.any() for aug in both)
-
-
-@pytest.fixture(params=["stand-in", "real"])
-def vision(request, monkeypatch):
-    with torchvision_of(request.param, monkeypatch) as tv_tensors:
-        yield importlib.import_module("camtorch.augment.torchvision"), tv_tensors
 
 
 def sample(tv):

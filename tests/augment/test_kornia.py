@@ -21,9 +21,9 @@ CLASSES = adapter.RandomMount, adapter.RandomLens, adapter.RandomCamera
 KEYS = ["input", "mask", "keypoints", "bbox"]
 
 
-def camera(**numbers):
-    values = {"intrinsics": [95.0, 96.0, 62.5, 48.25], "distortion": [-0.2, 0.05, 0.001, -0.001, 0.0]} | numbers
-    return ct.BrownConrady(*values.values(), image_size=SIZE).requires_grad_(False)
+def camera():
+    numbers = [95.0, 96.0, 62.5, 48.25], [-0.2, 0.05, 0.001, -0.001, 0.0]
+    return ct.BrownConrady(*numbers, image_size=SIZE).requires_grad_(False)
 
 
 def images(count=3, channels=1, size=SIZE):

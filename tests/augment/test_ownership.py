@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from test_augment import pinhole
+from cameras import pinhole
 from test_augment import sample as every_field
 
 import camtorch as ct
@@ -14,7 +14,7 @@ SIZE, COUNT = (60, 80), 3
 
 
 def camera(count=None):
-    one = pinhole(focal=60.0, size=SIZE)
+    one = pinhole(SIZE, 60.0)
     return one if count is None else one.replace(intrinsics=one.intrinsics.repeat(count, 1)).requires_grad_(False)
 
 

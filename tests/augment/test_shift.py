@@ -1,20 +1,17 @@
 """A mount that moves, by the depth of the sample: against what a camera at the new place sees."""
 
+from functools import partial
+
 import pytest
 import torch
+from cameras import fisheye
 
 import camtorch as ct
 import camtorch.augment.numpy
 
 CENTRE, RADIUS = (0.05, 0.02, 0.75), 0.17  # of a ball before a slanted wall
 WALL, AWAY = (0.1, -0.05, 1.0), 1.3
-
-
-def lens(size=(120, 160)):
-    focal = 0.45 * size[1]
-    numbers = [focal, focal, (size[1] - 1) / 2, (size[0] - 1) / 2], [0.02, -0.004, 0.001, 0.0]
-    camera = ct.KannalaBrandt(*(torch.tensor(n, dtype=torch.float64) for n in numbers), image_size=size)
-    return camera.requires_grad_(False)
+lens = partial(fisheye, size=(120, 160), focal=0.45, dtype=torch.float64)
 
 
 def seen(camera, start, rays):
@@ -41,7 +38,7 @@ def sample_of(camera):
 
 @pytest.mark.parametrize("kind", ["distance", "depth"])
 def test_the_image_is_what_a_camera_there_sees(kind):
-    camera = lens((240, 320))
+    camera = lens(size=(240, 320))
     sample = sample_of(camera)
     if kind == "depth":
         sample["depth"] = sample.pop("distance") * camera.rays()[0][..., 2].clamp(min=0)
@@ -81,7 +78,7 @@ def test_the_image_is_what_a_camera_there_sees(kind):
 
 
 def test_what_was_hidden_is_empty_and_not_valid():
-    camera = lens((360, 480))
+    camera = lens(size=(360, 480))
     sample = sample_of(camera)
     still, shift = dict.fromkeys(("yaw", "pitch", "roll")), ((0.05, 0.05), (0, 0), (0, 0))
     augment = ct.augment.RandomMount(**still, shift=shift, valid_mask=True, fill=-1)

@@ -3,18 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from cameras import fisheye
 from torch.utils.data import DataLoader, Dataset
 
 import camtorch as ct
 import camtorch.augment.numpy
 
 SIZE, SMALL, COUNT = (12, 16), (24, 32), 8
-
-
-def camera(dtype=torch.float32):
-    # learnable, as a camera is unless somebody says otherwise
-    intrinsics = torch.tensor([9.0, 9.2, 7.4, 5.6], dtype=dtype)
-    return ct.KannalaBrandt(intrinsics, torch.tensor([0.02, -0.01, 0.004, -0.001], dtype=dtype), image_size=SIZE)
 
 
 def augmentation(**options):
@@ -25,7 +20,7 @@ class Samples(Dataset):
     """The same sample again and again."""
 
     def __init__(self, arrays):
-        self.camera, self.augmentation = camera(), augmentation(p=0.9)
+        self.camera, self.augmentation = fisheye(SIZE, 0.56).requires_grad_(), augmentation(p=0.9)
         self.transform = ct.augment.numpy.Transform(self.augmentation) if arrays else self.augmentation
         self.arrays = arrays
 

@@ -2,23 +2,20 @@
 
 import json
 import pickle
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 import webdataset as wds
+from cameras import fisheye
 from torch.utils.data import DataLoader, Dataset
 
 import camtorch as ct
 import camtorch.augment.numpy
 
 SIZE = (24, 32)
-
-
-def camera(dtype=torch.float32):
-    intrinsics = torch.tensor([18.0, 18.2, 15.4, 11.6], dtype=dtype)
-    coefficients = torch.tensor([0.02, -0.01, 0.004, -0.001], dtype=dtype)
-    return ct.KannalaBrandt(intrinsics, coefficients, image_size=SIZE).requires_grad_(False)
+camera = partial(fisheye, SIZE, 0.56)
 
 
 def augmentation(**options):
@@ -168,7 +165,7 @@ def test_rows_are_the_same_in_every_batch(ragged):
 
 
 def test_rows_have_cameras_of_their_own():
-    cameras = [camera(), ct.Pinhole.from_fov(70, image_size=SIZE).double(), camera(torch.float64)]
+    cameras = [camera(), ct.Pinhole.from_fov(70, image_size=SIZE).double(), camera(dtype=torch.float64)]
     some = [row | ct.data.to_columns(one) for row, one in zip(rows(3), cameras, strict=True)]
     moved = ct.data.MapBatches(augmentation(camera=None), key=["path", "label"], seed=1)(batch(some))
     for i, (row, one) in enumerate(zip(some, cameras, strict=True)):

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 import torch
-from cameras import one
+from cameras import fisheye, one
 from torch import nn
 
 import camtorch as ct
@@ -38,9 +38,8 @@ def to_onnx(module, *inputs, **options):
     return program.model, run
 
 
-def fisheye(**options):
-    values = [60.0, 60.0, 63.5, 47.5], [0.02, -0.01, 0.003, -0.001]
-    return ct.KannalaBrandt(*values, image_size=(96, 128), **options)
+def camera():
+    return fisheye((96, 128)).requires_grad_()
 
 
 def smooth(batch=1):
@@ -59,7 +58,8 @@ BICUBIC = {"mode": "bicubic", "padding_mode": "border", "fill": (0.1, 0.2, 0.3)}
 @pytest.mark.slow
 def test_a_dewarp_with_options_and_one_without_is_a_plain_gridsample(options):
     images = smooth(2 if options else 1)
-    warp = ct.Dewarp(fisheye().double(), **options, tolerance=0.0)  # the program's positions are exact
+    # the program's positions are exact
+    warp = ct.Dewarp(camera().double(), **options, tolerance=0.0)
     model, run = to_onnx(warp, images, opset_version=None if options else 16)
     torch.testing.assert_close(run(images)[0], warp(images).detach(), atol=1e-5, rtol=0)
     if not options:
@@ -71,7 +71,7 @@ def test_a_dewarp_with_options_and_one_without_is_a_plain_gridsample(options):
 
 @pytest.mark.slow
 def test_a_dewarp_takes_any_batch_and_bytes():
-    warp, images = ct.Dewarp(fisheye()), (255 * smooth()).to(torch.uint8)
+    warp, images = ct.Dewarp(camera()), (255 * smooth()).to(torch.uint8)
     model, run = to_onnx(warp, images, dynamic_shapes={"images": {0: "batch"}})
     assert kinds(model).count("GridSample") == 1
     many = images.expand(3, -1, -1, -1).contiguous()
@@ -158,7 +158,7 @@ def legacy_onnx(module, inputs):
 
 @pytest.mark.filterwarnings("ignore")  # both are deprecated, and say which sizes become constants
 def test_a_recorded_run_holds_the_map_of_a_frozen_warp_and_no_camera():
-    warp = ct.Dewarp(fisheye())
+    warp = ct.Dewarp(camera())
     network, images = nn.Sequential(warp, nn.ReLU()), smooth()
     network(images)
     for record in (legacy_onnx, torch.jit.trace):
@@ -176,8 +176,8 @@ def test_a_recorded_run_holds_the_map_of_a_frozen_warp_and_no_camera():
 def test_the_exporter_of_recorded_runs_takes_no_camera(method):
     class Network(nn.Module):
         def forward(self, values):
-            camera = fisheye()
-            return camera.rays()[0] * values.sum() if method == "rays" else getattr(camera, method)(values)
+            lens = camera()
+            return lens.rays()[0] * values.sum() if method == "rays" else getattr(lens, method)(values)
 
     with pytest.raises(RuntimeError, match=r"KannalaBrandt: dynamo must be True in torch.onnx.export.*; got False"):
         legacy_onnx(Network(), (torch.rand(5, 2 + (method == "project")),))

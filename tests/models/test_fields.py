@@ -15,8 +15,8 @@ PIXELS = torch.tensor([[20.0, 40.0], [150.0, 30.0]], dtype=torch.float64)
 FISHEYE = [70.0, 71.0, 111.0, 112.5], [0.05, -0.01, 0.002, 0.0]
 
 
-def fisheye(**options):
-    return ct.KannalaBrandt(*(torch.tensor(t, dtype=torch.float64) for t in FISHEYE), image_size=SIZE, **options)
+def fisheye():
+    return ct.KannalaBrandt(*(torch.tensor(t, dtype=torch.float64) for t in FISHEYE), image_size=SIZE)
 
 
 def posed():

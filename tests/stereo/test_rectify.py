@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from cameras import KEYS, one
+from cameras import KEYS, fisheye, one
 
 import camtorch as ct
 from camtorch.poses.rotations import rotation_matrix
@@ -17,6 +17,7 @@ PROJECTIONS = ("perspective", "latlon", "cylindrical")
 LENSES = {"left": ([500.0, 505, 320, 240], [-0.2, 0.05, 0.001, -0.001, 0.0])}
 LENSES |= {"right": ([520.0, 515, 330, 235], [-0.1, 0.02, -0.001, 0.001, 0.0])}
 TURN, SHIFT = [0.02, -0.05, 0.01], [-0.12, 0.005, 0.004]
+WIDE = fisheye((480, 640), 0.28, torch.float64)
 
 
 def sized(key):
@@ -30,14 +31,9 @@ def pair():
     return left, right, ct.Extrinsics(TURN, SHIFT).double()
 
 
-def fisheye():
-    camera = ct.KannalaBrandt([180.0, 180, 319.5, 239.5], [0.02, 0, 0, 0], image_size=(480, 640))
-    return camera.double().requires_grad_(False)
-
-
 def fisheyes(pitch=0.0, **options):
     extrinsics = ct.Extrinsics([pitch, 0, 0], [-0.1, 0, 0]).double().requires_grad_(False)
-    return ct.rectify(fisheye(), fisheye(), extrinsics, **options)
+    return ct.rectify(WIDE, WIDE, extrinsics, **options)
 
 
 def random_pair(seed, vertical=False):
@@ -135,7 +131,7 @@ def test_opencv_has_the_same_matrices():
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
 def test_images_of_a_far_scene_are_the_same(projection):
-    camera = fisheye()
+    camera = WIDE
     extrinsics = ct.Extrinsics([0.05, 0.1, -0.03], [-0.1, 0.01, 0]).double().requires_grad_(False)
     found = ct.rectify(camera, camera, extrinsics, projection=projection)
 

@@ -1,12 +1,13 @@
 """Images whose channels come last in memory, as NumPy, OpenCV and Pillow have them: read and written where they lie."""
 
-import functools
 import warnings
+from functools import cache, partial
 
 import numpy as np
 import PIL.Image
 import pytest
 import torch
+from cameras import fisheye
 from torch.profiler import ProfilerActivity, profile
 
 import camtorch as ct
@@ -14,13 +15,8 @@ import camtorch.augment.numpy
 from camtorch.native.library import native_available
 
 SIZE = (50, 70)
+camera = partial(fisheye, size=SIZE, focal=0.7)
 needs_native = pytest.mark.skipif(not native_available(), reason="there is no compiled sampler")
-
-
-def camera(size=SIZE):
-    height, width = size
-    numbers = [0.7 * width, 0.7 * width, (width - 1) / 2, (height - 1) / 2]
-    return ct.BrownConrady(numbers, [-0.1, 0.02, 0.0, 0.001, 0.0], image_size=size).requires_grad_(False)
 
 
 def colours(channels=3, dtype=np.uint8, size=SIZE):
@@ -73,7 +69,7 @@ ARRAYS = {
 def test_arrays_of_any_strides_come_out_dense_and_alone(name, p):
     array = ARRAYS[name]()
     before, dense = array.copy(), np.array(array, array.dtype.newbyteorder("="), order="C")
-    mount = ct.augment.RandomMount(camera=camera(array.shape[:2]), min_filled=0, p=p)
+    mount = ct.augment.RandomMount(camera=camera(size=array.shape[:2]), min_filled=0, p=p)
     move, results = ct.augment.numpy.Transform(mount), []
     draw = mount.draw(1, torch.Generator().manual_seed(1))
     with warnings.catch_warnings():
@@ -115,7 +111,7 @@ LARGE = (360, 480)
 def test_nothing_as_large_as_an_image_is_made_but_the_result(read_only):
     array = colours(size=(400, 500))[4:364, 7:487]
     array.flags.writeable = not read_only
-    move = ct.augment.numpy.Transform(ct.augment.RandomMount(camera=camera(LARGE)))
+    move = ct.augment.numpy.Transform(ct.augment.RandomMount(camera=camera(size=LARGE)))
     out, large = allocated(lambda: move(image=array), array.nbytes)
     assert large in ([], ["aten::empty"])  # none where the memory of results is kept
     assert out["image"].shape == array.shape
@@ -130,7 +126,7 @@ LAYOUTS = {
 }
 
 
-@functools.cache
+@cache
 def dewarp(mode, tolerance):
     return ct.Dewarp(camera(), mode=mode, tolerance=tolerance)
 
@@ -177,15 +173,15 @@ WARPS = {
     "learning": lambda: ct.Dewarp(camera().requires_grad_()),
     "nearest": lambda: ct.Warp(camera(), camera(), TURNS[1], mode="nearest"),
     "kept": lambda: ct.Warp(camera(), camera(), TURNS[1], padding_mode="border", antialias=True).pin(),
-    "a panorama": lambda: ct.Warp(ROUND, camera((30, 40)), TURNS[1]),
-    "a plane": lambda: ct.PlaneWarp(camera(), camera((30, 40)), FLOOR, (0.0, 0.0, 1.0), 2.0),
+    "a panorama": lambda: ct.Warp(ROUND, camera(size=(30, 40)), TURNS[1]),
+    "a plane": lambda: ct.PlaneWarp(camera(), camera(size=(30, 40)), FLOOR, (0.0, 0.0, 1.0), 2.0),
     "from above": lambda: ct.BirdsEye(camera(), FLOOR, x=(-2, 2), y=(0, 4), resolution=0.1),
     "a shutter": lambda: ct.ShutterWarp(camera(), camera(), shutter=ct.RollingShutter(0.02, [0.0, 2.0, 1.0])),
     "a box": lambda: ct.views.look_at(camera(), [10.0, 10, 40, 40], (24, 32)),
     "a mirror": lambda: ct.augment.HorizontalFlip().change(camera(), {"apply": torch.ones(1)}).parts[0].warp,
     "a map": _map,
     "a pair": lambda: lambda images: PAIR(images, images)[1],
-    "two cameras": lambda: ct.Warp(camera(), camera((30, 40)), TURNS),
+    "two cameras": lambda: ct.Warp(camera(), camera(size=(30, 40)), TURNS),
 }
 FIRST, LAST = (lambda images: images), (lambda images: images.movedim(-3, -1).numpy())
 HELD = {  # what users hold of images (2, C, H, W), the same of a warp's result

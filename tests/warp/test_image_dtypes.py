@@ -5,6 +5,7 @@ from itertools import cycle
 import numpy as np
 import pytest
 import torch
+from cameras import fisheye, pinhole, turn
 
 import camtorch as ct
 from camtorch.warp.sampling import MODES, PADDINGS
@@ -12,14 +13,7 @@ from camtorch.warp.sampling import MODES, PADDINGS
 SIZE = (40, 50)
 OPTIONS = {"antialias": True}, {"fill": 3.0}, {"padding_mode": "border"}
 INTEGERS = (torch.int8, torch.uint8, torch.int16, torch.uint16, torch.int32, torch.uint32, torch.int64, torch.uint64)
-
-
-PINHOLE = ct.Pinhole([30.0, 30.0, 24.5, 19.5], image_size=SIZE).requires_grad_(False)
-FISHEYE = ct.KannalaBrandt([20.0, 20, 25, 19], [0.02, -0.01, 0.004, -0.001], image_size=SIZE).requires_grad_(False)
-
-
-def turn(*degrees, dtype=torch.float32):
-    return ct.augment.mount_rotation(*(torch.tensor(float(d), dtype=dtype) for d in (*degrees, 0, 0)[:3]))
+PINHOLE, FISHEYE = pinhole(SIZE), fisheye(SIZE, 0.4)
 
 
 def ids(dtype, count=1):

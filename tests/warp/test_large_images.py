@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from cameras import fisheye, turn
 
 import camtorch as ct
 from camtorch.warp import plan, sampling
@@ -11,9 +12,9 @@ SIZE = (90, 120)
 
 def pair(rotation=(30.0, 10.0, 25.0)):
     """From a lens to a wide target that looks aside: part of it is off the image, part has no ray."""
-    source = ct.KannalaBrandt([60.0, 61, 58, 44], [0.02, -0.01, 0.004, -0.001], image_size=SIZE).requires_grad_(False)
+    source = fisheye(SIZE, 0.5)
     target = ct.Equirectangular([22.0, 22, 49.5, 34.5], image_size=(70, 100)).requires_grad_(False)
-    return source, target, ct.augment.mount_rotation(*(torch.tensor(angle) for angle in rotation))
+    return source, target, turn(*rotation)
 
 
 def images(dtype, count=1):

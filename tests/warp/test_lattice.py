@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from cameras import each_kind, make, real
+from cameras import each_kind, make, real, turn
 
 import camtorch as ct
 
@@ -44,7 +44,7 @@ def check_padded(source, target, rotation, padding):
 def test_tolerances_hold_beyond_the_rim(key, padding):
     camera = next(iter(real(key).values())).float().requires_grad_(False).resize(240, 320)
     wide = ct.KannalaBrandt(torch.tensor([50.0, 50.0, 159.5, 119.5]), torch.zeros(4), image_size=(240, 320))
-    rotation = ct.augment.mount_rotation(*(torch.tensor(angle) for angle in (20.0, -10.0, 30.0)))
+    rotation = turn(20.0, -10.0, 30.0)
     check_padded(camera, wide.requires_grad_(False), rotation, padding)
     check_padded(camera, wide, None, padding)
 
@@ -52,7 +52,7 @@ def test_tolerances_hold_beyond_the_rim(key, padding):
 @each_kind
 def test_real_lenses_keep_their_tolerance(key):
     camera = next(iter(real(key).values())).float().requires_grad_(False).resize(240, 320)
-    rotation = ct.augment.mount_rotation(*(torch.tensor(angle) for angle in (20.0, -10.0, 30.0)))
+    rotation = turn(20.0, -10.0, 30.0)
     check(camera, ct.Dewarp(camera).target, None)
     check(camera, camera, rotation)
     check(ct.Dewarp(camera).target, camera, rotation)

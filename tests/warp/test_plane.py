@@ -1,15 +1,18 @@
 """Planes: what pinholes make of them is a homography, and for every camera a point of the plane lands where it is."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
+from cameras import fisheye
 
 import camtorch as ct
 from camtorch.poses.rotations import rotation_matrix
 
 TURN, SHIFT = torch.tensor([0.05, -0.1, 0.03]).double(), torch.tensor([0.2, -0.1, 0.15]).double()
 NORMAL, DISTANCE = torch.tensor([0.1, 0.3, 1.0]).double(), 2.5
+wide = partial(fisheye, focal=0.3, dtype=torch.float64)
 
 
 def pinholes():
@@ -20,14 +23,6 @@ def pinholes():
 
 def pose():
     return ct.Extrinsics(TURN, SHIFT).requires_grad_(False)
-
-
-def wide(size=(480, 640)):
-    """190 degrees."""
-    height, width = size
-    focal = width / 2 / math.radians(95)
-    camera = ct.KannalaBrandt([focal, focal, (width - 1) / 2, (height - 1) / 2], [0.01, -0.002, 0, 0], image_size=size)
-    return camera.double().requires_grad_(False)
 
 
 def above_ground(height=2.0, pitch=35.0):
@@ -57,7 +52,7 @@ def test_of_pinholes_it_is_the_homography():
 
 
 def test_beyond_the_horizon_nothing_is_valid():
-    source, target = wide(), wide((60, 80))
+    source, target = wide((480, 640)), wide((60, 80))
     floor = ct.PlaneWarp(source, target, pose(), (0.0, 1.0, 0.0), 1.5)
     rays, has_ray = target.rays()
     mask = floor.valid_mask()[0, 0]

@@ -1,20 +1,16 @@
 """Depth: points of pixels, and images of other cameras at other places by a depth map."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
+from cameras import fisheye
 
 import camtorch as ct
 
 SIZE = (12, 16)
-
-
-def fisheye(dtype=torch.float64, size=SIZE):
-    height, width = size
-    intrinsics = [width / 3, width / 3 + 0.5, (width - 1) / 2, (height - 1) / 2]
-    camera = ct.KannalaBrandt(intrinsics, [0.02, -0.01, 0.001, 0.0], image_size=size)
-    return camera.to(dtype).requires_grad_(False)
+lens = partial(fisheye, SIZE, dtype=torch.float64)
 
 
 def pinhole(size=(10, 14)):
@@ -48,7 +44,7 @@ def by_torch(images, depth, source, target, extrinsics, kind):
 
 @pytest.mark.parametrize(("kind", "wide"), [("z", True), ("distance", False)])
 def test_it_is_what_torch_samples_where_points_are_seen(kind, wide):
-    source, target = (pinhole(), fisheye()) if wide else (fisheye(), pinhole())
+    source, target = (pinhole(), lens()) if wide else (lens(), pinhole())
     images, depth = smooth(2, 3, *source.image_size), depths(2, 1, *target.image_size)
     depth[0, 0, 3, 4], depth[1, 0, 2, 2] = -1.0, math.nan
     result, valid = ct.Reproject(source, target, pose())(images, depth, kind)
@@ -60,7 +56,7 @@ def test_it_is_what_torch_samples_where_points_are_seen(kind, wide):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_identity_gives_the_image_back_to_the_bit(dtype):
-    camera = fisheye(dtype, (120, 161))
+    camera = fisheye((120, 161), dtype=dtype)
     stays = ct.Reproject(camera, camera, pose((0, 0, 0), (0, 0, 0)).to(dtype))
     images = torch.rand(2, 3, 120, 161, dtype=dtype)
     result, valid = stays(images, depths(1, 1, 120, 161).to(dtype), "distance")
@@ -69,7 +65,7 @@ def test_identity_gives_the_image_back_to_the_bit(dtype):
 
 
 def test_a_sweep_is_its_planes_one_by_one():
-    moved = ct.Reproject(pinhole(), fisheye(), pose())
+    moved = ct.Reproject(pinhole(), lens(), pose())
     images = smooth(2, 5, 10, 14)
     planes = torch.linspace(1, 8, 7).double().view(1, 7, 1, 1).expand(1, 7, *SIZE)
     volume, valid = moved(images, planes, "distance")
@@ -83,7 +79,7 @@ def test_a_sweep_is_its_planes_one_by_one():
 
 @pytest.mark.parametrize("kind", ["z", "distance"])
 def test_backprojected_points_are_seen_at_their_pixels(kind):
-    camera = fisheye()
+    camera = lens()
     depth = depths(3, 1, *SIZE)
     depth[0, 0, 0, 0], depth[1, 0, 5, 5], depth[2, 0, 6, 6] = 0.0, math.nan, math.inf
     points, valid = camera.backproject(depth, kind)

@@ -4,21 +4,12 @@ import math
 
 import pytest
 import torch
+from cameras import pinhole, turn
 
 import camtorch as ct
 from camtorch.native.library import native_available
 
 SIZE = (120, 160)
-
-
-def pinhole(size=SIZE, focal=140.0, dtype=torch.float32):
-    intrinsics = torch.tensor([focal, focal, (size[1] - 1) / 2, (size[0] - 1) / 2], dtype=dtype)
-    return ct.Pinhole(intrinsics, image_size=size).requires_grad_(False)
-
-
-def turn(*degrees, dtype=torch.float32):
-    angles = (torch.tensor(float(d), dtype=dtype) for d in degrees)
-    return ct.augment.mount_rotation(*angles)
 
 
 def zone_plate(side=512):
@@ -39,7 +30,7 @@ def alias_energy(image, shrunk_by):
 @pytest.mark.parametrize(("factor", "mode"), [(2, "bilinear"), (4, "bicubic"), (5.5, "bilinear")])
 def test_a_shrunk_zone_plate_shows_no_false_rings(factor, mode):
     plate = zone_plate()
-    camera = pinhole((512, 512), focal=500.0)
+    camera = pinhole((512, 512), 500.0)
     small = camera.resize(round(512 / factor), round(512 / factor))
     plain, smooth = (ct.Warp(camera, small, mode=mode, antialias=on)(plate) for on in (False, True))
     assert alias_energy(smooth, factor) < 0.05 * alias_energy(plain, factor)
@@ -52,7 +43,7 @@ def test_a_shrunk_zone_plate_shows_no_false_rings(factor, mode):
 
 def test_antialias_follows_the_local_scale():
     """Where nothing shrinks, nothing is smoothed; masks and single colours stay."""
-    camera = pinhole()
+    camera = pinhole(SIZE, 140.0)
     target = ct.KannalaBrandt([150.0, 150, 79.5, 59.5], [-0.25, 0.0, 0.0, 0.0], image_size=SIZE).requires_grad_(False)
     plain, smooth = (ct.Warp(camera, target, antialias=on) for on in (False, True))
     noise = torch.rand(1, 2, *SIZE)
@@ -74,7 +65,7 @@ def test_antialias_follows_the_local_scale():
 
 @pytest.mark.parametrize("mode", ["bilinear", "nearest", "bicubic"])
 def test_fill_takes_the_place_of_black(mode):
-    camera, rotation = pinhole(), turn(25, 10, 30)
+    camera, rotation = pinhole(SIZE, 140.0), turn(25, 10, 30)
     image = torch.rand(1, 3, *SIZE)
     black, filled = (ct.Warp(camera, camera, rotation, mode=mode, fill=fill) for fill in (0.0, (0.2, 0.4, 0.6)))
     value = torch.tensor([0.2, 0.4, 0.6])[:, None, None]
@@ -88,7 +79,7 @@ def test_fill_takes_the_place_of_black(mode):
 def test_pixels_without_a_ray_take_the_fill_in_every_padding_mode():
     behind = ct.KannalaBrandt([40.0, 40, 79.5, 59.5], image_size=SIZE).requires_grad_(False)
     for padding_mode in ("zeros", "border", "reflection"):
-        warp = ct.Warp(pinhole(), behind, turn(60, 0, 0), padding_mode=padding_mode, fill=7.0)
+        warp = ct.Warp(pinhole(SIZE, 140.0), behind, turn(60, 0, 0), padding_mode=padding_mode, fill=7.0)
         without = ~warp.by_pixel().mapped[0]
         assert without.any()
         assert (warp(torch.rand(1, 1, *SIZE))[0, 0][without] == 7).all()
@@ -97,7 +88,7 @@ def test_pixels_without_a_ray_take_the_fill_in_every_padding_mode():
 @pytest.mark.skipif(not native_available(), reason="without the compiled library positions are exact")
 @pytest.mark.parametrize("small", [False, True])
 def test_a_lattice_is_used_and_small_images_do_without(small):
-    cameras = [pinhole(focal=focal, dtype=torch.float64) for focal in (140.0, 120.0)]
+    cameras = [pinhole(SIZE, focal, torch.float64) for focal in (140.0, 120.0)]
     cameras = [camera.resize(16, 20) for camera in cameras] if small else cameras
     rotation = turn(10, 5, 20, dtype=torch.float64)
     exact, close = (ct.Warp(*cameras, rotation, tolerance=t).grid() for t in (0.0, 0.1))
@@ -105,7 +96,7 @@ def test_a_lattice_is_used_and_small_images_do_without(small):
 
 
 def test_a_lattice_does_not_mind_how_torch_multiplies_matrices():
-    camera, target = pinhole(), pinhole(focal=120.0)
+    camera, target = pinhole(SIZE, 140.0), pinhole(SIZE, 120.0)
     plain = ct.Warp(camera, target, turn(10, 5, 20), tolerance=0.01).grid()
     before = torch.get_float32_matmul_precision()
     try:
@@ -119,7 +110,7 @@ def test_a_lattice_does_not_mind_how_torch_multiplies_matrices():
 
 def test_options_reach_the_inverse_and_dewarp():
     options = {"mode": "bicubic", "padding_mode": "border", "fill": (0.5,), "antialias": True, "tolerance": 0.01}
-    warp = ct.Dewarp(pinhole(), **options)
+    warp = ct.Dewarp(pinhole(SIZE, 140.0), **options)
     assert warp.options == options == warp.inverse().options
 
 

@@ -5,26 +5,10 @@ from itertools import combinations
 
 import pytest
 import torch
-from cameras import make
+from cameras import SIZE, fisheye, make, pinhole, turn
 
 import camtorch as ct
 from camtorch.native.library import native_available
-
-SIZE = (48, 64)
-
-
-def turn(yaw=0.0, pitch=0.0, roll=0.0, dtype=torch.float32):
-    vector = torch.tensor([math.radians(pitch), math.radians(yaw), math.radians(roll)], dtype=dtype)
-    return ct.Extrinsics(vector, torch.zeros(3, dtype=dtype)).matrix()[:3, :3].detach()
-
-
-def fisheye(size=SIZE, scale=1.0, **options):
-    intrinsics = torch.tensor([24.0, 24.5, 31.0, 23.0], **options) * scale
-    return ct.KannalaBrandt(intrinsics, torch.tensor([0.02, -0.01, 0.004, -0.001], **options), image_size=size)
-
-
-def pinhole(size=SIZE, **options):
-    return ct.Pinhole(torch.tensor([30.0, 30.0, 31.5, 23.5], **options), image_size=size)
 
 
 def smooth(size=SIZE, batch=1, dtype=torch.float64):
