@@ -92,6 +92,13 @@ def test_natural_vignetting_is_of_the_true_angle(fov):
     assert torch.allclose(batch[:1] ** 2, light)
 
 
+@pytest.mark.parametrize("size", [(48, 64), (5, 9)])
+def test_vignetting_of_small_images(size):
+    camera = ct.Pinhole.from_fov(80, image_size=size).requires_grad_(False)
+    exact = camera.rays()[0][..., 2] ** 4
+    assert (ct.vignetting(camera)[0, 0] - exact).abs().max() < 1e-3
+
+
 def test_a_rim_beyond_ninety_degrees_keeps_its_light():
     lens = ct.KannalaBrandt.from_fov(220, image_size=(120, 160)).requires_grad_(False)
     light = ct.vignetting(lens)

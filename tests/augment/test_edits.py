@@ -433,6 +433,34 @@ def test_a_mirrored_face_without_a_table_is_told_once(count, name, monkeypatch):
     assert torch.equal(kept[..., 1], sample["keypoints"][..., 1])
 
 
+def test_sizes_of_one_number_in_a_list_are_torchvisions():
+    image = torch.rand(3, *SIZE)
+    assert A.Resize([24])(image=image)["image"].shape == A.Resize(24)(image=image)["image"].shape == (3, 24, 32)
+    assert A.CenterCrop((24,))(image=image)["image"].shape == (3, 24, 24)
+
+
+def test_what_is_told_of_each_landmark_changes_places_with_it():
+    tables = dict.fromkeys(("keypoints", "visibility"), "coco17")
+    flip = A.HorizontalFlip(1.0, landmarks=tables)
+    image, keypoints, flags = torch.rand(2, 3, *SIZE), torch.rand(2, 17, 2) * 40, torch.arange(34).view(2, 17)
+    swapped = flags[:, list(A.LANDMARKS["coco17"])]
+    assert torch.equal(flip(image=image, keypoints=keypoints, visibility=flags)["visibility"], swapped)
+    lists = flip(image=image, keypoints=list(keypoints), visibility=list(flags))["visibility"]
+    assert torch.equal(torch.stack(lists), swapped)
+    one = flip(image=image[0], keypoints=keypoints[0], visibility=flags[0])
+    assert torch.equal(one["visibility"], swapped[0])
+    given = {"keypoints": keypoints[0].numpy(), "visibility": flags[0].numpy()}
+    arrays = camtorch.augment.numpy.Transform(flip)(image=np.zeros((*SIZE, 3), np.uint8), **given)
+    np.testing.assert_array_equal(arrays["visibility"], swapped[0].numpy())
+    still = A.HorizontalFlip(0.0, landmarks=tables)(image=image, keypoints=keypoints, visibility=flags)
+    assert torch.equal(still["visibility"], flags)
+    for wrong, error in ((flags[0], "must be"), (flags[:1], "must be of 2 samples, as others; got 1")):
+        with pytest.raises(ValueError, match=error):
+            flip(image=image, keypoints=keypoints, visibility=wrong)
+    with pytest.raises(TypeError, match="visibility has a table"):
+        flip(image=image[0], keypoints=keypoints[0], visibility=[2] * 17)
+
+
 def test_left_and_right_change_places():
     image, left, right = torch.zeros(6, 1, *SIZE), torch.randn(6, 3), torch.randn(6, 3)
     flip = A.HorizontalFlip()

@@ -379,3 +379,27 @@ def test_sequences_and_mappings_need_not_be_python_s():
     moves = ct.data.MapBatches(ct.augment.RandomCamera("webcam", camera=left), key=Options(["path"]))
     image = np.zeros((1, *left.image_size, 3), np.uint8)
     assert moves({"image": image, "path": np.array(["a"])})["image"].shape == image.shape
+
+
+STEREO = LENS, LENS, ct.Extrinsics([0.0] * 3, [-0.1, 0.0, 0.0])
+IN_DEGREES = {
+    **{f"{key}.from_fov": lambda fov, key=key: ct.MODELS[key].from_fov(fov, image_size=SIZE) for key in ct.MODELS},
+    "from_fov of a batch": lambda fov: ct.Pinhole.from_fov(torch.tensor([fov, 90.0]), image_size=SIZE),
+    "Dewarp": lambda fov: ct.Dewarp(LENS, fov=fov),
+    "a panorama": lambda fov: ct.Dewarp(LENS, fov=fov, projection="equirectangular"),
+    "rectify": lambda fov: ct.rectify(*STEREO, fov=fov),
+    "rectify, vertically": lambda fov: ct.rectify(*STEREO, fov=(90, fov)),
+    "ring": lambda fov: ct.views.ring(LENS, 3, fov=fov),
+    "RandomMount": lambda fov: A.RandomMount(fov=fov),
+    "RandomLens": lambda fov: A.RandomLens("kannala_brandt", fov=(fov, 90)),
+    "real": lambda fov: A.RandomCamera("real", fov=(fov, 100)),
+    "CameraHead": lambda fov: ct.CameraHead(8, "pinhole", image_size=SIZE, fov=(fov, 80)),
+}
+
+
+@pytest.mark.parametrize("door", IN_DEGREES)
+def test_a_field_of_view_is_in_degrees_at_every_door(door):
+    for radians in (1, 2.1, 2 * math.pi):
+        with pytest.raises(ValueError, match=f"must be in degrees; .*radians.* {math.degrees(radians):.4g} degrees"):
+            IN_DEGREES[door](radians)
+    IN_DEGREES[door](6.5 if "Camera" not in door else 60)

@@ -235,3 +235,10 @@ def test_features_of_another_size_are_refused():
         layer(torch.zeros(2, 8))
     with pytest.raises(ValueError, match=r"numbers must be \(\*B, 3\), focal, cx, cy"):
         layer.camera(torch.zeros(2, 8))
+
+
+@pytest.mark.parametrize("model", ["pinhole", "kannala_brandt"])
+def test_heads_of_no_features_and_on_the_meta_device(model):
+    head = ct.CameraHead(8, model, image_size=SIZE)
+    assert head(torch.randn(0, 8)).batch_shape == (0,)
+    assert head.to("meta")(torch.randn(2, 8, device="meta")).batch_shape == (2,)
