@@ -15,7 +15,7 @@ from camtorch.augment import collate
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 LINUX = pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="memory is torch's own here")
-BATCH, BATCHES = 4, 30
+BATCH, BATCHES = 4, 16
 
 
 class Numbers(Dataset):

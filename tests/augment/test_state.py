@@ -93,10 +93,7 @@ CHANGES = {
     "a range": (RANGED, lambda one: one.ranges.update({first(one): narrower(one.ranges[first(one)])})),
     "ranges": (RANGED, lambda one: setattr(one, "ranges", {n: narrower(r) for n, r in one.ranges.items()})),
     "order of ranges": (RANGED, lambda one: setattr(one, "ranges", dict(reversed(one.ranges.items())))),
-    "order of ranges in place": (
-        RANGED,
-        lambda one: one.ranges.update({first(one): one.ranges.pop(first(one))}),
-    ),
+    "order of ranges in place": (RANGED, lambda one: one.ranges.update({first(one): one.ranges.pop(first(one))})),
     "one more range": (LIKES, lambda one: one.ranges.update(zoom=A.Range(1.2, 1.3))),
     "a range of a part": (["Compose"], lambda one: one.augmentations[1].ranges.update(yaw=A.Range(20, 30))),
     "p of a part": (["Compose"], lambda one: setattr(one.augmentations[0], "p", 0.9)),
@@ -177,11 +174,12 @@ def test_results_follow_each_attribute(name, attribute):
         return
     for one in (used, new):
         setattr(one, attribute, value)
-    assert results(used) == results(new)
+    found = results(used)
+    assert found == results(new)
     # these attributes are parts of what the argument of their name says
     parts = {"fov": "fov" in getattr(used, "ranges", ()), "image_size": name == "FaceNormalizer", "times": True}
     if attribute in inspect.signature(KINDS[name][0]).parameters and not parts.get(attribute, attribute == "options"):
-        assert results(used) == results(made(name, **{attribute: value}))
+        assert found == results(made(name, **{attribute: value}))
 
 
 @pytest.mark.parametrize(("name", "change"), slow_unless(lambda c: c[0] in QUICK, EDITS))
@@ -190,9 +188,9 @@ def test_results_follow_changes(name, change):
     results(used)
     for one in (used, new):
         CHANGES[change][1](one)
-    assert results(used) == results(new)
-    if change == "like of another model":
-        assert results(used) == results(made(name, like=LIKE_OTHERWISE))
+    found = results(used)
+    assert found == results(new)
+    assert change != "like of another model" or found == results(made(name, like=LIKE_OTHERWISE))
 
 
 def test_values_that_are_set_later_are_checked():

@@ -217,7 +217,7 @@ def test_the_curve_is_near_with_short_pieces_and_ends_where_the_lens_does(key):
     for curve in curves:
         assert len(curve) > 1
         assert curve.diff(dim=0).norm(dim=-1).max() <= 20
-    share = torch.linspace(0, 1, 201, dtype=torch.float64)[:, None]
+    share = torch.linspace(0, 1, 101, dtype=torch.float64)[:, None]
     dense = torch.cat([a + share * (b - a) for a, b in itertools.pairwise(points)])
     pixels, valid = camera.project(dense)
     near = valid & ((pixels - pixels.new_tensor([camera.width / 2, camera.height / 2])).norm(dim=-1) < 3 * camera.width)

@@ -160,10 +160,6 @@ def test_the_rule_holds_with_gradients_and_options():
         assert ct.Dewarp(camera())(images, **option).is_contiguous(memory_format=torch.channels_last)
 
 
-def _map():
-    return ct.LookupMap(torch.rand(30, 40, 2, dtype=torch.float64) * 60, SIZE, "test", {})
-
-
 PAIR = ct.rectify(camera(), camera(), ct.Extrinsics([0.0, 0.02, 0.0], [-0.1, 0.0, 0.0])).requires_grad_(False)
 FLOOR = ct.Extrinsics([1.2, 0.0, 0.0], [0.0, 1.0, 0.0]).requires_grad_(False)
 TURNS = ct.augment.mount_rotation(*torch.tensor([[0.0, 30], [9, 0], [0, 20]]))
@@ -179,11 +175,11 @@ WARPS = {
     "a shutter": lambda: ct.ShutterWarp(camera(), camera(), shutter=ct.RollingShutter(0.02, [0.0, 2.0, 1.0])),
     "a box": lambda: ct.views.look_at(camera(), [10.0, 10, 40, 40], (24, 32)),
     "a mirror": lambda: ct.augment.HorizontalFlip().change(camera(), {"apply": torch.ones(1)}).parts[0].warp,
-    "a map": _map,
+    "a map": lambda: ct.LookupMap(torch.rand(30, 40, 2, dtype=torch.float64) * 60, SIZE, "test", {}),
     "a pair": lambda: lambda images: PAIR(images, images)[1],
     "two cameras": lambda: ct.Warp(camera(), camera(size=(30, 40)), TURNS),
 }
-FIRST, LAST = (lambda images: images), (lambda images: images.movedim(-3, -1).numpy())
+LAST = lambda images: images.movedim(-3, -1).numpy()  # noqa: E731
 HELD = {  # what users hold of images (2, C, H, W), the same of a warp's result
     "single": (lambda images: images[0], lambda images: images[0]),
     "clips": (lambda images: images[:, None].expand(2, 3, -1, -1, -1), None),
