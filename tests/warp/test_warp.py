@@ -1,21 +1,18 @@
 """Laws of Warp: images, labels and derivatives move together."""
 
 import math
+from functools import partial
 from itertools import combinations
 
 import pytest
+import test_warp_laws
 import torch
 from cameras import SIZE, fisheye, make, pinhole, turn
 
 import camtorch as ct
 from camtorch.native.library import native_available
 
-
-def smooth(size=SIZE, batch=1, dtype=torch.float64):
-    """An image without detail that interpolation could lose."""
-    v, u = torch.meshgrid(*(torch.arange(side, dtype=dtype) for side in size), indexing="ij")
-    image = torch.stack((torch.sin(u / 9) * torch.cos(v / 7), u / size[1], v / size[0]))
-    return torch.stack([image * (1 + 0.1 * i) for i in range(batch)])
+smooth = partial(test_warp_laws.smooth, size=SIZE)
 
 
 @pytest.mark.parametrize("key", sorted(ct.MODELS))

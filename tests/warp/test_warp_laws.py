@@ -88,9 +88,10 @@ def made(warp, images):
     return warp(images, DEPTH.to(images.dtype), "distance")[0] if isinstance(warp, ct.Reproject) else warp(images)
 
 
-def smooth(count=1, dtype=torch.float64):
-    v, u = torch.meshgrid(*(torch.arange(side, dtype=dtype) for side in SIZE), indexing="ij")
-    image = torch.stack((torch.sin(u / 5) * torch.cos(v / 4), u / 32, v / 24))
+def smooth(count=1, dtype=torch.float64, size=SIZE):
+    """Images without detail that interpolation could lose."""
+    v, u = torch.meshgrid(*(torch.arange(side, dtype=dtype) for side in size), indexing="ij")
+    image = torch.stack((torch.sin(u / 5) * torch.cos(v / 4), u / size[1], v / size[0]))
     return torch.stack([image * (1 + 0.1 * i) for i in range(count)])
 
 
