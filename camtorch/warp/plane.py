@@ -94,9 +94,8 @@ class PlaneWarp(ProxyWarp):
         normal = (rotation.to(dtype) @ self.normal.to(dtype)[..., None])[..., 0]
         return normal, self.distance + (normal * shift).sum(-1)
 
-    @property
-    def tensors(self) -> list[Tensor]:
-        return [*super().tensors, self.normal, self.distance]
+    def _proxy(self) -> tuple[Tensor, ...]:
+        return *super()._proxy(), self.normal, self.distance
 
     def _nearness(self, rays: Tensor, of_source: bool) -> tuple[Tensor, Tensor]:
         normal, distance = self._plane_of_source() if of_source else (self.normal, self.distance)

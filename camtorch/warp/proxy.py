@@ -33,13 +33,18 @@ class ProxyWarp(Warp):
         """Return source from target: rotations (*B, 3, 3) and shifts (*B, 3)."""
         return rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation
 
+    def _proxy(self) -> tuple[Tensor, ...]:
+        """Return the tensors of the pose and of the proxy."""
+        return self.extrinsics.rotation, self.extrinsics.translation
+
     def _nearness(self, rays: Tensor, of_source: bool) -> tuple[Tensor, Tensor]:
         """Return 1 / distance to the proxy along unit rays (B, *N, 3) of either camera, and whether they meet it."""
         raise NotImplementedError
 
     @property
     def tensors(self) -> list[Tensor]:
-        return [*super().tensors, self.extrinsics.rotation, self.extrinsics.translation]
+        # the compiler follows no property of super()
+        return [*self.source.tensors, *self.target.tensors, *self._proxy()]
 
     def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
         if not self.antialias:
