@@ -19,7 +19,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.data.columns import PARTS, camera_of, to_columns
 from camtorch.data.seeded import Key, Seeded
 from camtorch.values.arguments import as_mapping, is_list, shown
-from camtorch.warp.proxy import ProxyWarp
+from camtorch.warp.plane import PlaneWarp
 from camtorch.warp.warp import Warp
 
 Batch = dict[str, Any]  # column -> an array or a list, all with as many rows
@@ -31,7 +31,7 @@ class Always(Augmentation):
     """A single warp that is applied to every sample."""
 
     def __init__(self, warp: Warp, owner: str, fields: Mapping[str, str] | None = None):
-        if isinstance(warp, ProxyWarp):
+        if isinstance(warp, PlaneWarp):
             raise TypeError(f"{owner}: warp must move labels too; got {type(warp).__name__}. Call it on images alone")
         if warp.batch_shape:
             raise ValueError(f"{owner}: the warp must be a single one; got batch dims {tuple(warp.batch_shape)}")

@@ -20,7 +20,7 @@ from camtorch.values.arguments import Numbers, as_flag, as_fov, as_image_size, a
 from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.arrays import Image
 from camtorch.warp.dewarp import middle_lines
-from camtorch.warp.proxy import check_pose
+from camtorch.warp.reproject import check_pose
 from camtorch.warp.warp import Warp, as_sized
 
 Projection = Literal["perspective", "latlon", "cylindrical"]

@@ -12,15 +12,20 @@ from typing_extensions import Unpack
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import as_own, known_false, values_of
 from camtorch.poses.extrinsics import Extrinsics
+from camtorch.poses.rotations import rotation_matrix, turn
 from camtorch.values.arguments import Numbers, as_batch, as_coordinates, as_number, as_real, shown
-from camtorch.warp.proxy import ProxyWarp, beside
-from camtorch.warp.sampling import WarpOptions
+from camtorch.warp.grid import Sampling, pixels_of_rows, scaled_rows, to_positions
+from camtorch.warp.moving import placed
+from camtorch.warp.panorama import off_poles
+from camtorch.warp.reproject import beside, check_pose
+from camtorch.warp.sampling import PaddingMode, WarpOptions
 from camtorch.warp.views import pinhole
+from camtorch.warp.warp import Warp
 
 _GRAZING = 1e-9  # a ray of a smaller cosine to the plane's normal does not meet the plane
 
 
-class PlaneWarp(ProxyWarp):
+class PlaneWarp(Warp):
     """A `Warp` of the image of a plane, from camera `source` to camera `target` at another place.
 
     Points on the plane are exact; objects above it are smeared, as in every such image. For pinholes it is the
@@ -41,6 +46,7 @@ class PlaneWarp(ProxyWarp):
             fit; and as `Warp`. TypeError: If a camera is no Camera, or extrinsics are no Extrinsics.
     """
 
+    is_an_operator = False
     batch_shape: torch.Size
     normal: Tensor
     distance: Tensor
@@ -54,8 +60,10 @@ class PlaneWarp(ProxyWarp):
         distance: Numbers,
         **options: Unpack[WarpOptions],
     ):
-        super().__init__(source, target, extrinsics, **options)
+        super().__init__(source, target, tolerance=0.0, **options)
         owner = type(self).__name__
+        batch = check_pose(owner, extrinsics, "source from target", source=source, target=target)
+        self.extrinsics = extrinsics
         device = source.intrinsics.device
         normal, distance = as_real(normal, "normal", owner, device), as_real(distance, "distance", owner, device)
         if normal.ndim not in (1, 2) or normal.shape[-1] != 3 or distance.ndim > 1:
@@ -63,8 +71,7 @@ class PlaneWarp(ProxyWarp):
                 f"{owner}: normal must be (3,) or (B, 3) and distance a number or (B,); got {tuple(normal.shape)} and "
                 f"{tuple(distance.shape)}"
             )
-        cameras = (*self.batch_shape, 1)
-        self.batch_shape = as_batch(owner, cameras=cameras, normal=normal.shape, distance=(*distance.shape, 1))
+        self.batch_shape = as_batch(owner, cameras=(*batch, 1), normal=normal.shape, distance=(*distance.shape, 1))
         for name, value in (("normal", normal), ("distance", distance)):
             self.put(name, as_own(value), persistent=True)
         self._check(owner)
@@ -87,6 +94,10 @@ class PlaneWarp(ProxyWarp):
                 "in the target's frame. Check that the extrinsics are source from target"
             )
 
+    def _pose(self) -> tuple[Tensor, Tensor]:
+        """Return source from target: rotations (*B, 3, 3) and shifts (*B, 3)."""
+        return rotation_matrix(self.extrinsics.rotation), self.extrinsics.translation
+
     def _plane_of_source(self) -> tuple[Tensor, Tensor]:
         """Return the normal (*B, 3) and the distance (*B,) in the source's frame."""
         rotation, shift = self._pose()
@@ -94,10 +105,42 @@ class PlaneWarp(ProxyWarp):
         normal = (rotation.to(dtype) @ self.normal.to(dtype)[..., None])[..., 0]
         return normal, self.distance + (normal * shift).sum(-1)
 
-    def _proxy(self) -> tuple[Tensor, ...]:
-        return *super()._proxy(), self.normal, self.distance
+    @property
+    def tensors(self) -> list[Tensor]:
+        pose = self.extrinsics.rotation, self.extrinsics.translation
+        return [*self.source.tensors, *self.target.tensors, *pose, self.normal, self.distance]
+
+    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
+        if not self.antialias:
+            return Sampling(*self._of_rows(rows), None)
+        return scaled_rows(self.sampled, rows, self.target.size_for("Warp")[0], self._of_rows)
+
+    def _of_rows(self, rows: range) -> tuple[Tensor, Tensor]:
+        pixels = pixels_of_rows(self.target, rows)
+        batch = self.batch_shape or (1,)
+        seen, mapped = self.move(pixels.expand(*batch, *pixels.shape), back=True)
+        if self.seam is not None:
+            seen = seen + seen.new_tensor(self.seam.rims[::2])
+        return to_positions(seen, mapped, self.sampled.size_for("Warp")), mapped
+
+    def move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
+        source, target = (self.target, self.source) if back else (self.source, self.target)
+        rays, has_ray = source.unproject(pixels)
+        # the other camera sees the points that the rays meet in these directions
+        rotation, shift = (t.to(rays.dtype) for t in self._pose())
+        if not back:
+            rotation, shift = rotation.mT, -(rotation.mT @ shift[..., None])[..., 0]
+        near, meets = self._nearness(rays, of_source=not back)
+        directions = turn(rotation, rays, "rays") + beside(shift, rays) * near[..., None]
+        seen, mapped = target.project(off_poles(target, directions))
+        return placed(target, seen, mapped & has_ray & meets, on_image)
+
+    def transform_rays(self, rays: Numbers) -> Tensor:
+        rays = as_coordinates(rays, "rays", 3, type(self).__name__, self.source.intrinsics.device, "B, *N")
+        return turn(self._pose()[0].mT.to(rays.dtype), rays, "rays")
 
     def _nearness(self, rays: Tensor, of_source: bool) -> tuple[Tensor, Tensor]:
+        """Return 1 / distance to the plane along unit rays (B, *N, 3) of either camera, and whether they meet it."""
         normal, distance = self._plane_of_source() if of_source else (self.normal, self.distance)
         normal = beside(normal / distance[..., None], rays)
         near = (rays * normal).sum(-1)

@@ -13,12 +13,11 @@ from camtorch.evaluate.tensors import are_plain, known_true
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, turn
 from camtorch.rays.depth import as_depth, depth_scale
-from camtorch.values.arguments import Numbers, check_devices, one_of, shown
+from camtorch.values.arguments import Numbers, as_batch, check_devices, one_of, shown
 from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.panorama import off_poles, seam_of
-from camtorch.warp.proxy import beside, check_pose
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, render
 from camtorch.warp.warp import as_sized
 
@@ -151,3 +150,25 @@ class Reproject(GeometryModule):
 
     def extra_repr(self) -> str:
         return f"mode={self.mode!r}, padding_mode={self.padding_mode!r}, fill={self.fill!r}"
+
+
+def check_pose(owner: str, extrinsics: Extrinsics, between: str, **cameras: Camera) -> torch.Size:
+    """Return the batch dim, or none, of cameras and the pose between them; raise if they do not fit."""
+    if not isinstance(extrinsics, Extrinsics):
+        raise TypeError(
+            f"{owner}: extrinsics must be Extrinsics, {between}; got {type(extrinsics).__name__}. "
+            "ct.Extrinsics.from_matrix(R, T) makes one from OpenCV's R and T"
+        )
+    intrinsics = {name: camera.intrinsics for name, camera in cameras.items()}
+    check_devices(owner, **intrinsics, extrinsics=extrinsics.rotation)
+    parts = {**cameras, "extrinsics": extrinsics}
+    batch = as_batch(owner, **{name: (*part.batch_shape, 1) for name, part in parts.items()})
+    if len(batch) > 1:
+        raise ValueError(f"{owner}: cameras and extrinsics must have one batch dim at most; got {tuple(batch)}")
+    return batch
+
+
+def beside(vectors: Tensor, rays: Tensor) -> Tensor:
+    """Return vectors (3,) or (B, 3) in the dtype of rays (B, *N, 3) and in a shape that broadcasts against them."""
+    vectors = vectors.to(rays.dtype)
+    return vectors if vectors.ndim == 1 else vectors.view(len(vectors), *[1] * (rays.ndim - 2), 3)
