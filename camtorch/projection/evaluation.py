@@ -12,9 +12,10 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.nn.utils import parametrize
 
-from camtorch.evaluate.door import is_eager, is_native, keeps_graph, way_of
+from camtorch.evaluate.door import is_native, way_of
 from camtorch.evaluate.export import portable_export, with_values
 from camtorch.evaluate.kept import Kept, same
+from camtorch.evaluate.tensors import are_free
 from camtorch.native.library import warn_if_missing
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.rows import CameraRows, Direction, unusable
@@ -93,7 +94,7 @@ def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Na
             return None
         pairs.append(camera.tensors)
         inputs += pairs[-1]
-    if not (dtype.is_floating_point and is_eager(*inputs)) or keeps_graph(*inputs):
+    if not (dtype.is_floating_point and are_free(*inputs)):
         return None
     made = []
     for camera, (intrinsics, distortion) in zip(cameras, pairs, strict=True):

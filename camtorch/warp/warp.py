@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.door import is_exporting, keeps_graph
 from camtorch.poses.rotations import as_rotation, turn
 from camtorch.values.arguments import (
     LEFT,
@@ -28,7 +27,7 @@ from camtorch.values.module import typed_as
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.grid import OUTSIDE
-from camtorch.warp.plan import CameraPair, Plan
+from camtorch.warp.plan import CameraPair
 from camtorch.warp.sampling import (
     MODES,
     PADDINGS,
@@ -250,17 +249,7 @@ class Warp(CameraPair):
 
     def pin(self) -> Warp:
         """Compute the grid once, with its graph, for a warp whose cameras will not change; return the warp."""
-        # the operator of compiled code keeps its own; what inference mode makes could not be used in a graph later
-        is_operator = self.is_called(self.target.intrinsics.detach())
-        if self.is_pinned or is_operator or torch.is_inference_mode_enabled():
-            return self
-        if keeps_graph(*self.tensors):
-            where = self.positions("graph")
-        elif is_exporting():
-            where = self.positions("kept")
-        else:
-            where = self.computed(self.padding_mode, self.tolerance)
-        self._kept.renew(lambda: Plan(where, self.padding_mode))
+        self.pin_positions()
         return self
 
     def transform_points(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
