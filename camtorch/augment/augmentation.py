@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -87,7 +88,7 @@ class Augmentation(SampleTransform):
     """Of what comes out; None: that of what comes in."""
     drawn_on_host: bool = False
     """Whether it makes new cameras of the numbers of others alone, so that the CPU does for samples on any device."""
-    crops: Mapping[str, int]
+    crops: Mapping[str, int] = MappingProxyType({})
     """Boxes that a draw needs, by their names in it: which of each sample's."""
     p: float
     same_on_batch: bool
@@ -105,7 +106,7 @@ class Augmentation(SampleTransform):
         super().__init__(**options)
         self.p = as_part(p, "p", self._name, "probability")
         self.same_on_batch = as_flag(same_on_batch, "same_on_batch", self._name)
-        vars(self).update(ranges=dict(ranges or {}), crops={})  # which are properties of a `Compose`
+        self.ranges = dict(ranges or {})
         self.min_filled = None if min_filled is None else as_part(min_filled, "min_filled", self._name)
 
     @property

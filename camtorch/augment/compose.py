@@ -99,11 +99,16 @@ class Compose(Augmentation):
                 if wrong:
                     raise ValueError(f"{self._name}: parts must {reason}; got {kind} at place {i}")
 
-    @property
-    def ranges(self) -> Mapping[str, Range]:  # type: ignore[override]
+    @property  # type: ignore[override]
+    def ranges(self) -> Mapping[str, Range]:
         """The ranges of all parts, by the part's index and the name in it, as "0.yaw"; change those of a part."""
         own = [{"apply": Range(0, 1), **part.ranges} for part in self.parts]
         return MappingProxyType({f"{i}.{key}": value for i, ranges in enumerate(own) for key, value in ranges.items()})
+
+    @ranges.setter
+    def ranges(self, value: Mapping[str, Range]) -> None:
+        if value:
+            raise AttributeError(f"{self._name}: ranges must be those of the parts; got others. Set those of a part")
 
     @property
     def crops(self) -> Mapping[str, int]:  # type: ignore[override]

@@ -20,11 +20,10 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch import augment
-from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.change import Change
 from camtorch.augment.fields import OWN, is_text, kind_of
+from camtorch.augment.front_end import FrontEnd
 from camtorch.augment.kornia_parts import BasicAugmentationBase, ParamItem
-from camtorch.augment.sample import KeepsCamera, Sample, Single, detached, on_samples
+from camtorch.augment.sample import Sample, Single, detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import collate_cameras
 from camtorch.evaluate.door import pytree
@@ -34,25 +33,6 @@ from camtorch.values.module import remade
 Params: TypeAlias = dict[str, Tensor]
 KIND = "source_kind"
 _NUMBERS = "source_intrinsics", "source_distortion"
-
-
-class InContainers(KeepsCamera):
-    """An augmentation that moves the fields of dicts which kornia's containers do not know."""
-
-    augmentation: Augmentation
-    change: Callable[..., Change]
-
-    @on_samples
-    def _move_fields(self, fields: Sample, params: Params, kinds: dict[str, str], back: bool) -> Sample:
-        """Move the fields of a dict that kornia does not know, and return them with their flags."""
-        device = next((value.device for value in fields.values() if isinstance(value, Tensor)), torch.device("cpu"))
-        clips = int(params["video_batch_size"]) if "video_batch_size" in params else None
-        flat = {n: v.flatten(0, 1) for n, v in fields.items()} if clips else fields
-        with torch.autocast(device.type, enabled=False):
-            change = self.change(params, device)
-            moved = self.augmentation.moved_by(change.inverse() if back else change, flat, kinds, predicted=back)
-        kept = {n: v for n, v in moved.items() if n in fields or n.removesuffix("_valid") in kinds}
-        return {n: v.unflatten(0, (clips, -1)) for n, v in kept.items()} if clips else type(fields)(kept)
 
 
 def with_boxes(params: Any, boxes: Tensor) -> Any:
@@ -139,7 +119,7 @@ def kind_of_camera(camera: Camera) -> list[int]:
     return [zlib.crc32(model.encode()), camera.distortion.shape[-1], *(camera.image_size or (0, 0))]
 
 
-def _fields(container: Any, sample: Sample, ours: list[InContainers], single: bool) -> tuple[Sample, dict[str, str]]:
+def _fields(container: Any, sample: Sample, ours: list[FrontEnd], single: bool) -> tuple[Sample, dict[str, str]]:
     """Return the fields of a dict that kornia does not know and that move, and their kinds."""
     owner, own = type(container).__name__, {n: k for one in ours for n, k in one.augmentation.fields.items()}
     tables = {n for one in ours if one.augmentation.mirroring for n in one.augmentation.mirroring.by_name}
@@ -149,7 +129,7 @@ def _fields(container: Any, sample: Sample, ours: list[InContainers], single: bo
         raise ValueError(f"{owner}: a flag must be no kornia key; got {flags[0]}. Use its own keypoints_valid")
     kinds = {n: kind for n, v in given.items() if v is not None and (kind := kind_of(n, v, own, owner, single))}
     names = [*kinds, *(["camera"] if sample.get("camera") is not None else [])]
-    known = InContainers, IntensityAugmentationBase2D
+    known = FrontEnd, IntensityAugmentationBase2D
     others = (m for m in container.modules() if isinstance(m, BasicAugmentationBase) and not isinstance(m, known))
     for other in (type(module).__name__ for module in others if names):
         name = next((name for name in (other, other.removeprefix("Random")) if hasattr(augment, name)), None)
@@ -158,13 +138,26 @@ def _fields(container: Any, sample: Sample, ours: list[InContainers], single: bo
     return {n: v for n, v in given.items() if n in kinds or n.removesuffix("_valid") in kinds or n in tables}, kinds
 
 
+@on_samples
+def _moved(part: Any, fields: Sample, params: Params, kinds: dict[str, str], back: bool) -> Sample:
+    """Move the fields of a dict that kornia does not know by one of ours, and return them with their flags."""
+    device = next((value.device for value in fields.values() if isinstance(value, Tensor)), torch.device("cpu"))
+    clips = int(params["video_batch_size"]) if "video_batch_size" in params else None
+    flat = {n: v.flatten(0, 1) for n, v in fields.items()} if clips else fields
+    with torch.autocast(device.type, enabled=False):
+        change = part.change(params, device)
+        moved = part.augmentation.moved_by(change.inverse() if back else change, flat, kinds, predicted=back)
+    kept = {n: v for n, v in moved.items() if n in fields or n.removesuffix("_valid") in kinds}
+    return {n: v.unflatten(0, (clips, -1)) for n, v in kept.items()} if clips else type(fields)(kept)
+
+
 def _with_fields(
     call: Callable[..., Any], self: Any, *args: Any, back: bool, params: Any = None, data_keys: Any = None
 ) -> Any:
     """Move dicts together with the fields that kornia does not know."""
     if len(args) != 1 or not isinstance(args[0], dict):
         return call(self, *args, params=params, data_keys=data_keys)
-    ours = [one for one in self.modules() if isinstance(one, InContainers)]
+    ours = [one for one in self.modules() if isinstance(one, FrontEnd)]
     texts = {name: value for name, value in args[0].items() if is_text(value)}  # image_path is no image
     sample, camera = {n: value for n, value in args[0].items() if n not in texts}, args[0].get("camera")
     image = next((v for n, v in sample.items() if self._read_datakeys_from_dict((n,))[0] == [DataKey.INPUT]), None)
@@ -184,9 +177,9 @@ def _with_fields(
     result = call(self, sample, params=params)
     applied = [*_parts(self._params if params is None else params, self)]
     for one, own in reversed(applied) if back else applied:
-        if not isinstance(one, InContainers):
+        if not isinstance(one, FrontEnd):
             continue
-        fields = one._move_fields(fields, own, kinds, back) if kinds else fields
+        fields = _moved(one, fields, own, kinds, back) if kinds else fields
         if camera is not None:
             cameras = one.change(own).source if back else one.change(own).target
             cameras = (cameras[0] if alone else cameras).clone()
@@ -213,7 +206,7 @@ def _put(of: type[nn.Module], name: str, own: Callable[..., Any]) -> None:
 
     @functools.wraps(call)
     def method(self: Any, *args: Any, **kwargs: Any) -> Any:
-        ours = any(isinstance(one, InContainers) for one in self.modules())
+        ours = any(isinstance(one, FrontEnd) for one in self.modules())
         return own(call, self, *args, **kwargs) if ours else call(self, *args, **kwargs)
 
     setattr(of, name, method)

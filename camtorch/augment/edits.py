@@ -137,17 +137,7 @@ def _box_to(size: tuple[int, int], corner: Tensor, sides: Tensor) -> Tensor:
     return torch.cat((torch.diag_embed(scale), shift.unsqueeze(-1)), -1)
 
 
-class _Sized(Edit):
-    """An edit with results of one size, (height, width); one number makes a square."""
-
-    image_size: tuple[int, int]
-
-    def __init__(self, size: Size, ranges: Mapping[str, Range] | None = None, **options: Unpack[EditOptions]):
-        super().__init__(ranges, **options)
-        self.image_size = _as_size(size, self._name)
-
-
-class RandomResizedCrop(_Sized):
+class RandomResizedCrop(Edit):
     """A random box of the image, resized: as in torchvision, with a draw for each sample.
 
     Args:
@@ -157,6 +147,8 @@ class RandomResizedCrop(_Sized):
             than the image, it is smaller.
         options: see `Edit`.
     """
+
+    image_size: tuple[int, int]
 
     def __init__(
         self,
@@ -173,7 +165,8 @@ class RandomResizedCrop(_Sized):
             "ratio": Range(math.log(ratios.low), math.log(ratios.high)),
             "place": Range(0, 1, 2),
         }
-        super().__init__(size, ranges, **options)
+        super().__init__(ranges, **options)
+        self.image_size = _as_size(size, self._name)
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         rows, cols = size
@@ -185,7 +178,7 @@ class RandomResizedCrop(_Sized):
         return _box_to(self.image_size, (values["place"] * (whole - sides)).round(), sides), self.image_size
 
 
-class RandomCrop(_Sized):
+class RandomCrop(Edit):
     """A box of one size at a random place of the image.
 
     Args:
@@ -193,8 +186,11 @@ class RandomCrop(_Sized):
         options: see `Edit`.
     """
 
+    image_size: tuple[int, int]
+
     def __init__(self, size: Size, **options: Unpack[EditOptions]):
-        super().__init__(size, {"place": Range(0, 1, 2)}, **options)
+        super().__init__({"place": Range(0, 1, 2)}, **options)
+        self.image_size = _as_size(size, self._name)
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         (height, width), new = size, self.image_size
@@ -204,7 +200,7 @@ class RandomCrop(_Sized):
         return _box_to(new, corner, corner.new_tensor(new[::-1]).expand_as(corner)), new
 
 
-class CenterCrop(_Sized):
+class CenterCrop(Edit):
     """The middle of the image, with `fill` around it if the image is smaller.
 
     Args:
@@ -212,8 +208,11 @@ class CenterCrop(_Sized):
         options: see `Edit`.
     """
 
+    image_size: tuple[int, int]
+
     def __init__(self, size: Size, **options: Unpack[EditOptions]):
-        super().__init__(size, **options)
+        super().__init__(**options)
+        self.image_size = _as_size(size, self._name)
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         top, left = ((before - now) // 2 for before, now in zip(size, self.image_size, strict=True))

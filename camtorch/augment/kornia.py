@@ -24,8 +24,8 @@ from torch import Tensor
 from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
-from camtorch.augment.containers import KIND, InContainers, Params, camera_of, kind_of_camera, with_boxes, with_cameras
-from camtorch.augment.front_end import check_front_end, check_single
+from camtorch.augment.containers import KIND, Params, camera_of, kind_of_camera, with_boxes, with_cameras
+from camtorch.augment.front_end import FrontEnd, check_front_end, check_single
 from camtorch.augment.kornia_parts import transform_output_shape
 from camtorch.augment.sample import detached, on_samples
 from camtorch.cameras.camera import Camera
@@ -39,7 +39,7 @@ Flags: TypeAlias = dict[str, Any]
 _BACK = "back"  # the flag for moving back
 
 
-class CameraAugmentation(InContainers, GeometricAugmentationBase2D):
+class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     r"""An augmentation of camtorch as one of kornia: images, masks, keypoints and boxes move by the same warps.
 
     The same seed gives the same warps as calling the augmentation itself on a sample.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -68,20 +67,8 @@ _PLACES = {number: i for i, number in enumerate(INSIGHTFACE)}
 LANDMARKS["insightface106"] = tuple(INSIGHTFACE[LANDMARKS["lapa106"][_PLACES[i]]] for i in range(106))
 
 TableLike = str | Sequence[int] | Sequence[Sequence[int]]
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of landmarks that change places."""
-
-    order: tuple[int, ...]
-    exact: bool  # True: for exactly so many landmarks; pairs fit any number
-
-    def of(self, count: int) -> tuple[int, ...] | None:
-        """Return the order of `count` landmarks; None if the table is for another number."""
-        if count == len(self.order):
-            return self.order
-        return None if self.exact or count < len(self.order) else self.order + tuple(range(len(self.order), count))
+Table = tuple[tuple[int, ...], bool]
+"""An order, and whether it is for exactly so many landmarks; pairs fit any number from that on."""
 
 
 def as_table(value: TableLike, owner: str) -> Table:
@@ -90,7 +77,7 @@ def as_table(value: TableLike, owner: str) -> Table:
     if isinstance(value, str):
         if value not in LANDMARKS:
             raise ValueError(f"{wanted}; got {value!r}")
-        return Table(LANDMARKS[value], True)
+        return LANDMARKS[value], True
     try:
         items: list[Any] = list(value)
     except TypeError:
@@ -113,7 +100,7 @@ def as_table(value: TableLike, owner: str) -> Table:
             f"{owner}: landmarks must hold each landmark's partner, whose partner is the landmark itself, or "
             f"pairs that hold no index twice; got {value!r}"
         )
-    return Table(tuple(order), not pairs)
+    return tuple(order), not pairs
 
 
 # numbers of points that hardly anything else has
@@ -162,15 +149,17 @@ class Mirroring:
                     "landmarks={} to keep it"
                 )
             return None
-        order, own = table.of(count), len(table.order)
-        # 3D points may be no landmarks
-        if order is None and (kind != "points" or self._named is not None):
+        order, exact = table
+        own = len(order)
+        if count == own or (count > own and not exact):
+            return order + tuple(range(own, count))
+        if kind != "points" or self._named is not None:  # 3D points may be no landmarks
             others = [known for known, its in LANDMARKS.items() if len(its) == count]
             hint = f"landmarks={{{name!r}: {repr(others[0]) if others else '[(left, right), ...]'}}} gives it by field"
             if not others and count % own == 0:
                 hint = f"Several faces go in as (B, F, {own}, 2): {name}.unflatten(-2, (-1, {own}))"
             raise ValueError(f"{self.owner}: {name} must have {own} points, as landmarks has; got {count}. {hint}")
-        return order
+        return None
 
     def swapped(
         self, name: str, kind: str | None, value: Tensor, mirrored: Tensor, flags: bool, faces: set[tuple[int, ...]]

@@ -236,18 +236,21 @@ class SampleTransform(KeepsCamera, nn.Module):
         super().__setattr__(name, value)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        if "antialias" in state:  # an attribute before 0.5
+            state["_warps_decide"] = state.pop("antialias") is None
         super().__setstate__(state)  # type: ignore[no-untyped-call]
         self._calls = Calls()  # which states before 0.5 lack
+
+    _warps_decide: bool = False  # whether `antialias` is None
 
     @property
     def antialias(self) -> bool | None:
         """The option of that name; None if each warp decides."""
-        given = self.__dict__.get("antialias", False)  # states of 0.4 may lack it
-        return None if given is None else self.options["antialias"]
+        return None if self._warps_decide else self.options["antialias"]
 
     @antialias.setter
     def antialias(self, value: bool | None) -> None:
-        self.__dict__["antialias"] = value
+        self._warps_decide = value is None
         self.options["antialias"] = value is not None and as_flag(value, "antialias", self._name)
 
     mirroring: Mirroring | None = None  # what changes places where an augmentation mirrors; None: it never does
