@@ -21,7 +21,7 @@ from camtorch.augment import numpy as arrays
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.fields import KINDS, kind_of
 from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
-from camtorch.augment.sample import Unknown, detached
+from camtorch.augment.sample import Sample, Unknown, detached
 from camtorch.cameras.camera import Camera
 
 _OWNER = "albumentations.Transform"
@@ -82,6 +82,12 @@ class Transform(FrontEnd, A.DualTransform):
         return {"draw": {name: value.tolist() for name, value in drawn.items()}}
 
     def apply_with_params(self, params: dict[str, Any], *args: Any, **data: Any) -> dict[str, Any]:
+        fields, write = self._read(data)
+        draw = {name: torch.from_numpy(np.array(value, np.float64)) for name, value in params["draw"].items()}
+        return write(self._arrays(fields, draw=draw))
+
+    def _read(self, data: dict[str, Any]) -> tuple[Sample, Callable[[Sample], Sample]]:
+        """Return targets as `numpy.Transform` takes them, and the function that writes moved ones as given."""
         camera, places = self._source(data), {}
         fields = {} if isinstance(camera, Unknown) else {"camera": camera}
         for i, (name, value) in enumerate(data.items()):
@@ -90,17 +96,19 @@ class Transform(FrontEnd, A.DualTransform):
             if not own and not (target in _OWN[4:] and len(value) == 0):  # a name that begins with a kind is known
                 field = name if name == target else f"{kind_of(target, value, {}, _OWNER)}_{i}"
                 places[field], fields[field] = (name, target), _given(target, value, camera)
-        draw = {name: torch.from_numpy(np.array(value, np.float64)) for name, value in params["draw"].items()}
-        moved = self._arrays(fields, draw=draw)
-        change = self.augmentation.last
-        assert change is not None  # set by this call
-        result = data | {name: moved[name] for name in ("camera",) if name in moved}
-        for field, (name, target) in places.items():
-            seen = moved.get(f"{field}_valid")
-            result[name] = _taken(target, data[name], moved[field], seen, change.parts[0].image_size)
-            if seen is not None and target not in _OWN:
-                result[f"{name}_valid"] = seen
-        return result
+
+        def write(moved: Sample) -> Sample:
+            change = self.augmentation.last
+            assert change is not None  # set by the call that moved
+            result = data | {name: moved[name] for name in ("camera",) if name in moved}
+            for field, (name, target) in places.items():
+                seen = moved.get(f"{field}_valid")
+                result[name] = _taken(target, data[name], moved[field], seen, change.parts[0].image_size)
+                if seen is not None and target not in _OWN:
+                    result[f"{name}_valid"] = seen
+            return result
+
+        return fields, write
 
     def _source(self, data: dict[str, Any]) -> Camera:
         sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]

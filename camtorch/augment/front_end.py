@@ -13,7 +13,11 @@ from camtorch.values.arguments import GUESS_CAMERA, shown
 
 
 class FrontEnd(KeepsCamera):
-    """The base of front ends, which pass the samples of a library to an augmentation."""
+    """The base of front ends, which pass the samples of a library to an augmentation.
+
+    Its method `_read` returns a sample as the augmentation takes it, and a function that writes the moved one in the
+    form of the given one. kornia's calls a method for each kind of value instead.
+    """
 
     augmentation: Any
 

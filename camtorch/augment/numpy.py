@@ -75,8 +75,9 @@ class Transform(FrontEnd):
         **fields: Any,
     ) -> Sample:
         """Augment a sample: keyword arguments, a dict, or both; see `Augmentation.forward` for the other arguments."""
-        options = {"draw": draw, "generator": generator}
-        return self._moved(self.augmentation.forward, sample, fields, options, self.camera)
+        given, write = self._read(sample, fields, self.camera)
+        with torch.no_grad():
+            return write(self.augmentation.forward(given, **_set(draw=draw, generator=generator)))
 
     def inverse(
         self,
@@ -87,18 +88,20 @@ class Transform(FrontEnd):
         **fields: Any,
     ) -> Sample:
         """Move a sample back, see `Augmentation.inverse`: by the last call's change, or by `draw` and its `camera`."""
-        options = {} if draw is None else {"draw": draw, "camera": self.camera if camera is None else camera}
+        options = {} if draw is None else _set(draw=draw, camera=self.camera if camera is None else camera)
         if draw is None and camera is not None:
             fields["camera"] = camera
         with torch.no_grad():  # as the camera before may learn
-            return self._moved(self.augmentation.inverse, sample, fields, options)
+            given, write = self._read(sample, fields)
+            return write(self.augmentation.inverse(given, **options))
 
     def __repr__(self) -> str:
         return f"Transform({self.augmentation!r})"
 
-    def _moved(
-        self, move: Callable[..., Sample], sample: Any, fields: Sample, options: Sample, otherwise: Camera | None = None
-    ) -> Sample:
+    def _read(
+        self, sample: Any, fields: Sample, otherwise: Camera | None = None
+    ) -> tuple[Single, Callable[[Sample], Sample]]:
+        """Return a sample as the augmentation takes it, and the function that writes a moved one as it was given."""
         if sample is not None and not isinstance(sample, Mapping):
             raise TypeError(
                 f"{_OWNER}: sample must be a dict, or keywords as in transform(image=...); got {type(sample).__name__}"
@@ -109,7 +112,6 @@ class Transform(FrontEnd):
         camera = self.augmentation.camera if sample.get("camera") is None else sample["camera"]
         size = getattr(camera, "image_size", None)
         own, form = self.augmentation, _form_of(sample)
-        options = {key: value for key, value in options.items() if value is not None}
         if form is None:
             ways = self._ways(sample, size)
         else:
@@ -118,18 +120,20 @@ class Transform(FrontEnd):
         given = Single()
         for own_tensors in tensors.values():
             given.update(own_tensors)
-        with torch.no_grad():
-            moved = move(given, **options)
-        result = {
-            name: write(moved, sample[name])
-            for name, (_, write) in ways.items()
-            if tensors[name].keys() <= moved.keys()  # a face is moved back without its rotation
-        }
-        for name, value in moved.items():
-            if name not in given:
-                value = plain(value) if isinstance(value, Tensor) else value
-                result[name] = value[0] if name.endswith(_VALID) and value.ndim == 3 else value
-        return result
+
+        def written(moved: Sample) -> Sample:
+            result = {
+                name: write(moved, sample[name])
+                for name, (_, write) in ways.items()
+                if tensors[name].keys() <= moved.keys()  # a face is moved back without its rotation
+            }
+            for name, value in moved.items():
+                if name not in given:
+                    value = plain(value) if isinstance(value, Tensor) else value
+                    result[name] = value[0] if name.endswith(_VALID) and value.ndim == 3 else value
+            return result
+
+        return given, written
 
     def _kind(self, name: str, value: Any, sample: Mapping[str, Any]) -> str | None:
         """Return the kind of a field, or of the field whose validity it is; None if it is not moved."""
@@ -192,6 +196,11 @@ class Transform(FrontEnd):
             return images if many else np.stack(images)
 
         return each, joined
+
+
+def _set(**options: Any) -> Sample:
+    """Return the options that are not None."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _form_of(sample: Sample) -> tuple[Any, ...] | None:

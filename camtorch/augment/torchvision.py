@@ -20,7 +20,7 @@ from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
 from camtorch.augment.fields import IMAGES, KEEP, KINDS, OWN, as_tensor, kind_of, pattern_of
 from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
-from camtorch.augment.sample import Frames, detached, on_samples
+from camtorch.augment.sample import Frames, Sample, detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
 from camtorch.warp.arrays import as_planes_of
@@ -89,8 +89,15 @@ class Transform(FrontEnd, v2.Transform):
 
     @on_samples
     def forward(self, *inputs: Any) -> Any:
-        own = self.augmentation
-        flat, spec = pytree.tree_flatten_with_path(inputs if len(inputs) > 1 else inputs[0])
+        sample, kinds, write = self._read(inputs if len(inputs) > 1 else inputs[0])
+        return write(*self.augmentation._augmented(sample, kinds))
+
+    def _read(self, given: Any) -> tuple[Frames, dict[str, str], Callable[[Sample, Change], Any]]:
+        """Return the leaves of a nest that may move as a sample, their kinds, and the function that writes moved ones.
+
+        That function takes the moved sample and the change, and returns a nest like the given one.
+        """
+        flat, spec = pytree.tree_flatten_with_path(given)
         paths, leaves = [path for path, _ in flat], [leaf for _, leaf in flat]
         names = [_name(path) for path in paths]
         keys, fields, sizes = list(names), {}, []
@@ -106,23 +113,26 @@ class Transform(FrontEnd, v2.Transform):
         cameras = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Camera)]
         if len(cameras) > 1:
             raise ValueError(f"{_OWNER}: a sample must have one camera; got {len(cameras)}")
-        camera = camera_of_sample(_OWNER, own, leaves[cameras[0]] if cameras else self.camera, sizes)
+        camera = camera_of_sample(_OWNER, self.augmentation, leaves[cameras[0]] if cameras else self.camera, sizes)
         kinds = {keys[i]: kind or KEEP for i, (kind, _, _) in fields.items()}
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
         sample = Frames({keys[i]: value for i, (_, value, _) in fields.items()}, camera=detached(camera))
-        moved, change = own._augmented(sample, kinds)
-        for i, (kind, _, back) in fields.items():
-            if change.parts[0].moves is not None or not kind or type(leaves[i]) in _HELD:
-                leaves[i] = back(moved[keys[i]], change)
-        for i in cameras:
-            leaves[i] = moved["camera"]
-        result = pytree.tree_unflatten(leaves, spec)
-        for i in fields if self.valid else ():
-            path, valid = paths[i], moved.get(f"{keys[i]}_valid")
-            if valid is not None and path and isinstance(path[-1], pytree.MappingKey):
-                holder = functools.reduce(lambda held, step: step.get(held), path[:-1], result)
-                holder.setdefault(f"{names[i]}_valid", valid if isinstance(leaves[i], Tensor) else valid.numpy())
-        return result
+
+        def write(moved: Sample, change: Change) -> Any:
+            for i, (kind, _, back) in fields.items():
+                if change.parts[0].moves is not None or not kind or type(leaves[i]) in _HELD:
+                    leaves[i] = back(moved[keys[i]], change)
+            for i in cameras:
+                leaves[i] = moved["camera"]
+            result = pytree.tree_unflatten(leaves, spec)
+            for i in fields if self.valid else ():
+                path, valid = paths[i], moved.get(f"{keys[i]}_valid")
+                if valid is not None and path and isinstance(path[-1], pytree.MappingKey):
+                    holder = functools.reduce(lambda held, step: step.get(held), path[:-1], result)
+                    holder.setdefault(f"{names[i]}_valid", valid if isinstance(leaves[i], Tensor) else valid.numpy())
+            return result
+
+        return sample, kinds, write
 
     def _kinds(self, flat: list[Any], names: list[str]) -> dict[int, str | None]:
         """Return the kind of each leaf that moves, and None for those that may be flags or orders of landmarks."""
