@@ -275,7 +275,8 @@ KINDS = {
     "head_pose": _POSE,
     "pose": _POSE,
     "rvec": Field(
-        1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector, True, _column_hint, _check_rvec
+        *(1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector, True, _column_hint, _check_rvec),
+        way="rotation vectors",
     ),
     "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions, True, _column_hint, way="rays"),
     "rotation": Field(

@@ -134,13 +134,28 @@ static void narrowed(double *exact, int64_t count) {
 TURNED(float, fmaf)
 TURNED(double, fma)
 
+/* Rotations that turn, by vectors */
+static void turned_rotations(const Turned *given) {
+    const int64_t is_double = given->is_double, to = given->strides[1];
+    double turn[9], rotation[9], vector[3];
+    int still = 1;
+    for (int i = 0; i < 9; i++) turn[i] = number(given->turn, i, is_double), still &= turn[i] == (i % 4 == 0);
+    for (int64_t i = 0, at = 0; i < given->count && !still; i++, at += given->strides[0]) {
+        for (int k = 0; k < 3; k++) vector[k] = number(given->rows, at + k * to, is_double);
+        matrix_of(vector, rotation);
+        multiplied(turn, rotation, rotation);
+        vector_of(rotation, vector);
+        for (int k = 0; k < 3; k++) put(given->results, at + k * to, vector[k], is_double);
+    }
+}
+
 /* Whether the first three vectors are the columns of a rotation, as far as they are taken for one */
 static int is_rotation(const Turned *given) {
     double m[3][3], off = 0;
     for (int i = 0; i < 3; i++)
         for (int k = 0; k < 3; k++) {
             const int64_t at = i * given->strides[0] + k * given->strides[1];
-            m[i][k] = given->is_double ? ((const double *)given->rows)[at] : ((const float *)given->rows)[at];
+            m[i][k] = number(given->rows, at, given->is_double);
         }
     for (int i = 0; i < 3; i++)
         for (int j = i; j < 3; j++) {
@@ -166,8 +181,9 @@ EXPORTED int64_t camtorch_together(const Together *given) {
     for (int64_t i = 0; i < given->job_count && given->is_whole; i++) given->jobs[i].next = 0, camtorch_sample(given->jobs + i);
     for (int64_t i = 0; i < given->move_count; i++) left |= camtorch_moves(given->moves + i);
     for (const Turned *one = given->turned; one < given->turned + given->turned_count; one++) {
-        left |= one->is_pose && !is_rotation(one) ? LEFT_LABELS : 0;
-        if (one->turn) (one->is_double ? turned_double : turned_float)(one);
+        left |= one->form == POSE && !is_rotation(one) ? LEFT_LABELS : 0;
+        if (one->turn && one->form == ROTATION_VECTORS) turned_rotations(one);
+        else if (one->turn) (one->is_double ? turned_double : turned_float)(one);
     }
     return left << LEFT_BITS;
 }

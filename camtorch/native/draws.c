@@ -17,15 +17,6 @@ int64_t THIS(geometry)(const Rows *);
 int64_t THIS(moves)(const Move *);
 void THIS(domain)(const Domain *);
 
-static double number(const void *from, int64_t at, int64_t is_double) {
-    return is_double ? ((const double *)from)[at] : ((const float *)from)[at];
-}
-
-static void put(void *to, int64_t at, double value, int64_t is_double) {
-    if (is_double) ((double *)to)[at] = value;
-    else ((float *)to)[at] = (float)value;
-}
-
 /* Where the numbers of a camera lie, `size` of each */
 static void *row(const Draws *d, const void *all, int64_t camera, int64_t size) {
     return (char *)all + camera * size * (int64_t)(d->made.is_double ? sizeof(double) : sizeof(float));
@@ -173,12 +164,9 @@ static void turned(const Draws *d, int64_t c) {
 
 /* The part of a turn; `rotation_vector`, and its way back, by a quaternion */
 static void turned_less(const double *m, double part, double *turn) {
-    const double x = m[7] - m[5], y = m[2] - m[6], z = m[3] - m[1], xy = m[1] + m[3], yz = m[5] + m[7], zx = m[2] + m[6];
-    const double all[4][4] = {{1 + m[0] + m[4] + m[8], x, y, z}, {x, 1 + m[0] - m[4] - m[8], xy, zx},
-                              {y, xy, 1 - m[0] + m[4] - m[8], yz}, {z, zx, yz, 1 - m[0] - m[4] + m[8]}};
-    int largest = 0;
-    for (int i = 1; i < 4; i++) largest = all[i][i] > all[largest][largest] ? i : largest;
-    const double *q = all[largest], size = sqrt(dot(q + 1, q + 1)), half = part * atan2(size, fabs(q[0]));
+    double q[4];
+    quaternion_of(m, q);
+    const double size = sqrt(dot(q + 1, q + 1)), half = part * atan2(size, fabs(q[0]));
     const double by = (q[0] < 0 ? -1 : 1) * sin(half) / (size > 0 ? size : 1), w = cos(half);
     const double a = q[1] * by, b = q[2] * by, c = q[3] * by;
     const double made[9] = {1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b),

@@ -170,14 +170,17 @@ typedef struct {
 enum { SQUARES = STEP * STEP }; /* positions of a cell */
 enum { LEFT_BITS = 3 };
 
-/* Vectors of three numbers that turn, of the type of the rotation; NaN where one is not finite */
+/* What turns: vectors, NaN where one is not finite, of which the first three of a POSE are the columns of a rotation; or
+   vectors of rotations, of which a turn by nothing leaves the bits */
+enum { RAYS, POSE, ROTATION_VECTORS };
+
+/* Vectors of three numbers that turn, of the type of the rotation */
 typedef struct {
     const void *turn; /* (3, 3); NULL: they stay */
     const void *rows;
-    void *results;
+    void *results;      /* rows, until they turn */
     int64_t strides[2]; /* of both, by vector and component */
-    int64_t count, is_double;
-    int64_t is_pose; /* whether the first three are the columns of a rotation */
+    int64_t count, is_double, form;
 } Turned;
 
 /* One sample: a lattice of one camera, images that are sampled on it, in parts or whole, pixels that move, and vectors */

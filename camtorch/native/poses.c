@@ -627,19 +627,6 @@ static double agree(const Poses *given, Row *row, double *rotation, double *tran
     return converged && complete && enough ? cost : INFINITY;
 }
 
-/* By Shepperd's method; `rotation_vector` */
-static void vector_of(const double *m, double *vector) {
-    const double x = m[7] - m[5], y = m[2] - m[6], z = m[3] - m[1], xy = m[1] + m[3], yz = m[5] + m[7], zx = m[2] + m[6];
-    const double columns[4][4] = {{1 + m[0] + m[4] + m[8], x, y, z}, {x, 1 + m[0] - m[4] - m[8], xy, zx},
-                                  {y, xy, 1 - m[0] + m[4] - m[8], yz}, {z, zx, yz, 1 - m[0] - m[4] + m[8]}};
-    int most = 0;
-    for (int i = 1; i < 4; i++)
-        if (columns[i][i] > columns[most][most]) most = i;
-    const double *q = columns[most], size = sqrt(dot(q + 1, q + 1));
-    const double half = size > 0 ? atan2(size, fabs(q[0])) / size : 1 / fabs(q[0]);
-    for (int k = 0; k < 3; k++) vector[k] = (q[0] < 0 ? -2 : 2) * half * q[1 + k];
-}
-
 /* What a pose is worth: the vector of its rotation, the root mean square, and the covariance of turn and shift of the origin,
    from which the points' middle lies in the camera's axes */
 static void assess(const Poses *given, Row *row, int64_t at, double cost) {

@@ -87,11 +87,13 @@ def _answers(library: Library) -> Iterator[tuple[str, Iterable[float], Iterable[
     library.camtorch_turns(at(quarter), 3, at(turned), 1)
     yield "camtorch_turns", turned, (0, -1, 0, 1, 0, 0, 0, 0, 1)
 
-    one = structs.Turned(turn=at(turned), rows=at(points), results=out, count=4, is_double=1)
-    one.strides[:] = 3, 1
-    together = structs.Together(turned=at(one), turned_count=1, lattices=lattices)
-    most = library.camtorch_together(together)
-    yield "camtorch_together", (most, *made[:3]), (0, -2, 1, 4)
+    both = (structs.Turned * 2)()
+    for one, form, given in zip(both, (structs.RAYS, structs.ROTATION_VECTORS), (points, zeros), strict=True):
+        one.turn, one.rows, one.results, one.count, one.is_double, one.form = at(turned), at(given), out, 1, 1, form
+        one.strides[:], out = (3, 1), out + 24
+    together = structs.Together(turned=at(both), turned_count=2, lattices=lattices)
+    most, out = library.camtorch_together(together), at(made)
+    yield "camtorch_together", (most, *made[:6]), (0, -2, 1, 4, 0, 0, math.pi / 2)
 
     views = structs.Views(cameras=at(camera), points=at(points), rotations=at(unit), translations=at(zeros), problems=1)
     views.pixels, views.given, views.views, views.count, views.left = at(twos), at(ones), 1, 4, left

@@ -11,6 +11,15 @@
 #define EXPANDED(name, variant) NAMED(name, variant)
 #define THIS(name) EXPANDED(name, VARIANT)
 
+static inline double number(const void *from, int64_t at, int64_t is_double) {
+    return is_double ? ((const double *)from)[at] : ((const float *)from)[at];
+}
+
+static inline void put(void *to, int64_t at, double value, int64_t is_double) {
+    if (is_double) ((double *)to)[at] = value;
+    else ((float *)to)[at] = (float)value;
+}
+
 static inline double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 static inline void cross(const double *a, const double *b, double *c) {
@@ -28,6 +37,38 @@ static inline void multiplied(const double *a, const double *b, double *c) {
 
 static inline void applied(const double *m, const double *v, double *found) {
     for (int i = 0; i < 3; i++) found[i] = dot(m + 3 * i, v);
+}
+
+/* Rodrigues' formula, what is not a number to such; `rotation_matrix` */
+static inline void matrix_of(const double *vector, double *m) {
+    const double angle = sqrt(dot(vector, vector)), half = angle > 0 ? sin(angle / 2) / angle : angle + 0.5;
+    const double s = angle > 0 ? sin(angle) / angle : angle + 1, c = 2 * half * half;
+    for (int i = 0; i < 3; i++) {
+        const int j = (i + 1) % 3, k = (i + 2) % 3;
+        m[4 * i] = 1 - c * (vector[j] * vector[j] + vector[k] * vector[k]);
+        m[3 * i + j] = c * vector[i] * vector[j] - s * vector[k];
+        m[3 * j + i] = c * vector[i] * vector[j] + s * vector[k];
+    }
+}
+
+/* The quaternion w, x, y, z of a rotation, of any length: of four that are equal, one without cancellation, by Shepperd's
+   method */
+static inline void quaternion_of(const double *m, double *quaternion) {
+    const double x = m[7] - m[5], y = m[2] - m[6], z = m[3] - m[1], xy = m[1] + m[3], yz = m[5] + m[7], zx = m[2] + m[6];
+    const double columns[4][4] = {{1 + m[0] + m[4] + m[8], x, y, z}, {x, 1 + m[0] - m[4] - m[8], xy, zx},
+                                  {y, xy, 1 - m[0] + m[4] - m[8], yz}, {z, zx, yz, 1 - m[0] - m[4] + m[8]}};
+    int most = 0;
+    for (int i = 1; i < 4; i++)
+        if (columns[i][i] > columns[most][most]) most = i;
+    memcpy(quaternion, columns[most], sizeof columns[most]);
+}
+
+/* The other way; `rotation_vector` */
+static inline void vector_of(const double *m, double *vector) {
+    double q[4];
+    quaternion_of(m, q);
+    const double size = sqrt(dot(q + 1, q + 1)), half = size > 0 ? atan2(size, fabs(q[0])) / size : 1 / fabs(q[0]);
+    for (int k = 0; k < 3; k++) vector[k] = (q[0] < 0 ? -2 : 2) * half * q[1 + k];
 }
 
 /* Turns a matrix (3, 3), whose rows lie `width` apart, by Cayley's formula; `small_turn` */

@@ -7,7 +7,7 @@ from ctypes import POINTER, c_char_p, c_double, c_int32, c_int64, c_uint32, c_vo
 
 from camtorch.native.structure import Calls, Numbers, Struct
 
-CHECKSUM = 3689361709
+CHECKSUM = 1454573680
 
 UINT8 = 0
 BOOL = 1
@@ -80,6 +80,9 @@ LEFT_MOST = 4
 LEFT_LABELS = 4
 SQUARES = 64
 LEFT_BITS = 3
+RAYS = 0
+POSE = 1
+ROTATION_VECTORS = 2
 YAW = 0
 PITCH = 1
 ROLL = 2
@@ -496,7 +499,7 @@ class Turned(Struct):
         ("strides", c_int64 * 2),
         ("count", c_int64),
         ("is_double", c_int64),
-        ("is_pose", c_int64),
+        ("form", c_int64),
     )
     turn: int | None
     rows: int | None
@@ -504,7 +507,7 @@ class Turned(Struct):
     strides: Numbers
     count: int
     is_double: int
-    is_pose: int
+    form: int
 
 
 class Together(Struct):

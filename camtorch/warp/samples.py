@@ -26,11 +26,12 @@ from camtorch.warp.panorama import goes_round
 from camtorch.warp.plan import CameraPair
 from camtorch.warp.sampling import PADDINGS, SHRINKS, SURELY, Options, Sampler
 
-Label = Literal["pixels", "boxes", "rays", "columns", "pose"]
+Label = Literal["pixels", "boxes", "rays", "columns", "pose", "rotation vectors"]
 """What moves beside images: pixels, boxes, directions and points of the camera frame, or columns of such in a matrix,
-of which those of a pose begin with a rotation."""
+of which those of a pose begin with a rotation; or rotation vectors."""
 Sizes = tuple[tuple[int, int], tuple[int, int]]  # (height, width) of the source's image, and of the target's
 
+_FORMS = {"pose": structs.POSE, "rotation vectors": structs.ROTATION_VECTORS}  # others are rays
 _FEW = 2  # tiles of an image that one thread makes alone
 _EVEN = 4  # samples a thread from which on it matters little that the last ones leave some threads idle
 _PIXELS = 1 << structs.LEFT_BITS  # flags of what is left of pixels are times this
@@ -64,7 +65,7 @@ def call_for(
         options: of the warp.
         values: on the CPU and without a graph: images (B, C, H, W), masks (B, H, W) as well, and labels.
         hows: what values are. Labels are pixels (B, *N, 2) of the source's image; of a single sample boxes too, and, in
-            the dtype of the cameras, rays (*N, 3) and columns (3 or 4, N) that turn.
+            the dtype of the cameras, rays and rotation vectors (*N, 3) and columns (3 or 4, N) that turn.
         batched: whether there is a dim B.
     """
     tolerance, antialias, count = options["tolerance"], options["antialias"], len(values[0]) if batched else 1
@@ -194,8 +195,9 @@ class SampleCall:
                 slot.row_strides[:] = slot.result_strides[:] = each * many, each, 1
             else:
                 slot, width = next(turns), value.shape[-1]
-                slot.strides[:], slot.count = ((3, 1), value.numel() // 3) if how == "rays" else ((1, width), width)
-                slot.is_double, slot.is_pose = dtype == torch.float64, how == "pose"
+                is_matrix = how in ("columns", "pose")
+                slot.strides[:], slot.count = ((1, width), width) if is_matrix else ((3, 1), value.numel() // 3)
+                slot.is_double, slot.form = dtype == torch.float64, _FORMS.get(how, structs.RAYS)
             self._slots.append((slot, value.dtype == dtype and value.is_contiguous()))
         call.lattices = self._lattices.struct
         self._back = call.lattices.move

@@ -14,6 +14,7 @@ import camtorch.augment.numpy
 import camtorch.augment.plan
 from camtorch.evaluate.kept import Kept
 from camtorch.native.library import native_available
+from camtorch.poses.rotations import rotation_matrix, rotation_vector
 
 A = ct.augment
 SIZE = (96, 130)
@@ -125,6 +126,43 @@ def test_a_sample_of_a_batch_is_what_it_is_alone(name, dtype):
         assert torch.equal(cameras[i].intrinsics, one["camera"].intrinsics)
         assert torch.equal(cameras[i].distortion, one["camera"].distortion)
         assert all(torch.equal(value[i], one[field]) for field, value in batch.items())
+
+
+ANGLES = 0, 1e-30, 1e-8, 1e-3, 0.09, 0.11, 1, 2, math.pi - 1e-3, math.pi - 1e-7, math.pi, 4
+
+
+@pytest.mark.parametrize("scale", [1, 1e-6])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_rotation_vectors_turn_by_the_formulas_of_torch(dtype, scale):
+    augment = A.RandomMount(camera=example("pinhole", SIZE).to(dtype).requires_grad_(False))
+    torch.manual_seed(0)
+    axes = torch.nn.functional.normalize(torch.randn(len(ANGLES), 8, 3, dtype=torch.float64), dim=-1)
+    vectors = (axes * torch.tensor(ANGLES, dtype=torch.float64)[:, None, None]).flatten(0, 1).to(dtype)
+    draws, singles, rotations = augment.draw(len(vectors)), [], []
+    draws |= {key: draws[key] * scale for key in ("yaw", "pitch", "roll")}
+    for i, vector in enumerate(vectors):
+        draw = {key: value[i : i + 1] for key, value in draws.items()}
+        singles.append(augment(rvec=vector, draw=draw)["rvec"])
+        rotations.append(augment.last.rotation[0] @ rotation_matrix(vector))
+        assert not native_available() or augment._calls.plans.result.calls.result[0] == ["rvec"]  # a call of C turns it
+    turned, wanted, tolerance = torch.stack(singles), torch.stack(rotations), 8 * torch.finfo(dtype).eps
+    assert turned.dtype == dtype
+    torch.testing.assert_close(rotation_matrix(turned), wanted, rtol=0, atol=tolerance)
+    sure = turned.norm(dim=-1) < math.pi - 1e-3  # vectors of opposite axes are nearly one rotation around pi
+    torch.testing.assert_close(turned[sure], rotation_vector(wanted[sure]), rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_rotation_vectors_that_are_none_stay_none_and_those_that_do_not_turn_stay(dtype):
+    camera = example("pinhole", SIZE).to(dtype).requires_grad_(False)
+    still, turns = A.RandomMount(yaw=0, pitch=0, roll=0, camera=camera), A.RandomMount(camera=camera)
+    for values in ((math.nan, 1, 2), (0.1, 0.2, 0.3), (0, -0.0, 0)):
+        for vector in (torch.tensor(values, dtype=dtype), torch.tensor([values], dtype=dtype)):
+            moved = turns(rvec=vector)["rvec"]
+            assert torch.isfinite(moved).all() if math.isfinite(sum(values)) else torch.isnan(moved).all()
+            if native_available():  # torch reads and writes vectors of a single sample
+                out = still(rvec=vector)["rvec"]
+                torch.testing.assert_close(1 / out, 1 / vector, rtol=0, atol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize("name", LAST)
