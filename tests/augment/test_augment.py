@@ -217,6 +217,14 @@ def test_skipped_samples_stay_bit_identical(name):
         assert torch.equal(out["camera"].intrinsics[skipped][0], batch["camera"].intrinsics)
 
 
+def test_ranges_of_a_chain_are_those_of_its_parts():
+    chain = ct.augment.Compose([ct.augment.RandomMount(yaw=5)])
+    with pytest.raises(AttributeError, match="ranges must be those of the parts"):
+        chain.ranges = {"yaw": ct.augment.Range(1, 2)}
+    chain.augmentations[0].ranges["yaw"] = ct.augment.Range(1, 2)
+    assert chain.ranges["0.yaw"] == ct.augment.Range(1, 2)
+
+
 def test_chains_carry_validity_on():
     torch.manual_seed(0)
     batch = {k: v for k, v in sample().items() if k != "depth"}
