@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.door import has_tangent, keeps_graph
 from camtorch.models import Pinhole
 from camtorch.poses.rotations import mount_rotation
 from camtorch.rays.lattices import slopes_at_axis
@@ -28,10 +29,11 @@ from camtorch.values.arguments import (
 from camtorch.values.dtypes import check_averaged, narrow, widen
 from camtorch.values.module import GeometryModule, remade, typed_as
 from camtorch.warp.boxes import corners_of
+from camtorch.warp.crops import CropsWarp, flattened
 from camtorch.warp.sampling import Mode
 from camtorch.warp.warp import Warp, as_sized
 
-__all__ = ["FACES", "Views", "cube", "look_at", "ring"]
+__all__ = ["FACES", "Views", "crop_place", "cube", "look_at", "ring"]
 
 FACES = ("front", "right", "back", "left", "up", "down")
 """Names of a cube's faces, as the camera sees them from within; its axis goes through the middle of the front."""
@@ -200,40 +202,104 @@ def look_at(camera: Camera, boxes: Numbers, image_size: Sequence[int], *, margin
     A plain crop of a face off the axis shows the face as seen from the side of the lens: wider, leaning, and turned
     against the same face on the axis. The new camera looks along the ray of the box's middle, and the source's y axis
     stays in its y-z plane, so that upright stays upright. Its pixels are square, its principal point is the middle of
-    the image, and its focal length is the largest at which the outline of box and margin is inside the image.
+    the image, and its focal length is the largest at which the outline of box and margin is inside the image. For
+    pinhole images this is Perspective Crop Layers (Yu et al., CVPR 2021, arXiv 2011.13607). Such a crop hides where the
+    thing was: a network that needs it, as for depth, is given `crop_place(warp)` too.
 
     Args:
         camera: the camera of the images, of any model, with image_size; single, or a batch of B.
-        boxes: (B, 4) or (4,), pixels x1, y1, x2, y2 of the camera's images, whole numbers at the middles of pixels.
+        boxes: (B, 4) or (4,), pixels x1, y1, x2, y2 of the camera's images, whole numbers at the middles of pixels; or
+            (B, F, 4), F boxes of each of B images.
         image_size: (height, width) of the crop.
         margin: how far left and right move out, in widths of the box, and top and bottom, in heights.
 
     Returns:
         A `Warp` to a `Pinhole` of batch (B,), or single for one box. Images (1, C, H, W) of a single camera give B
         crops. `warp.transform_points`, `.transform_rays` and so on move labels, `warp.inverse()` takes them back,
-        `warp.target` is the new camera and `warp.rotation` its turn, `ray_crop = R ray_camera`. Boxes, and all that
-        follows from them, have no gradients.
+        `warp.target` is the new camera and `warp.rotation` its turn, `ray_crop = R ray_camera`.
+
+        For boxes (B, F, 4) it is a `CropsWarp` to a `Pinhole` of batch (B, F): images (B, C, H, W) give crops
+        (B, F, C, h, w), and labels have the leading dims (B, F).
+
+        All has gradients to boxes that require grad, so that a network can move its own crop. There is none to the
+        camera by the place of the crop, which counts as given; a camera that learns has those of any `Warp`. The
+        outline has the gradient of the points that touch the crop's sides: if two touch at once, that of one of them,
+        and where the lens ends on the outline, as if that end stayed in its place along the edge.
 
     Raises:
         ValueError: If a box cannot be looked at; the message names it.
     """
     camera, owner = as_sized(camera, "camera", "look_at"), "look_at"
     given = as_values(boxes, "boxes", owner, camera.intrinsics.device)
-    if given.ndim not in (1, 2) or given.shape[-1] != 4:
+    if given.ndim not in (1, 2, 3) or given.shape[-1] != 4:
         raise ValueError(
-            f"{owner}: boxes must be (B, 4) or (4,), pixels x1, y1, x2, y2; got shape {tuple(given.shape)}"
+            f"{owner}: boxes must be (B, 4), (4,) or (B, F, 4), pixels x1, y1, x2, y2; got shape {tuple(given.shape)}"
         )
     batch = tuple(camera.batch_shape)
-    if len(batch) > 1 or (batch and given.ndim == 2 and len(given) != batch[0]):
+    if len(batch) > 1 or (batch and given.ndim > 1 and len(given) != batch[0]):
         raise ValueError(f"{owner}: boxes must be one for each camera of one batch dim; got {len(given)} for {batch}")
     size = as_known_size(image_size, owner)
-    rows = given if given.ndim == 2 else given.expand(*(batch or (1,)), 4)
-    intrinsics, rotation = looking_at(camera, rows, size, as_margin(margin, owner), owner)
+    rows = given if given.ndim > 1 else given.expand(*(batch or (1,)), 4)
+    each = flattened(camera, rows.shape[:-1]) if rows.ndim == 3 else camera
+    intrinsics, rotation = looking_at(each, rows, size, as_margin(margin, owner), owner)
     if given.ndim == 1 and not batch:
         intrinsics, rotation = intrinsics[0], rotation[0]
     dtype = torch.promote_types(camera.intrinsics.dtype, torch.float32)
     intrinsics, rotation = intrinsics.to(dtype), rotation.to(dtype)
+    if given.ndim == 3:
+        return CropsWarp(camera, pinhole(intrinsics, size), rotation)
     return Warp(camera, pinhole(intrinsics, size)).turned_by(rotation)
+
+
+def crop_place(warp: Warp) -> Tensor:
+    """Return where a crop lies and how wide it is: the numbers that a network of crops should be given too.
+
+    A crop that looks at a thing hides the thing's direction and size in the whole image. A network that predicts depth,
+    or anything in the camera's frame, needs them, as in Perspective Crop Layers (arXiv 2011.13607).
+
+        >>> camera = ct.KannalaBrandt.from_fov(150, image_size=(480, 640))
+        >>> warp = ct.views.look_at(camera, [[40, 200, 120, 300], [300, 200, 360, 280]], (64, 64))
+        >>> ct.views.crop_place(warp).shape
+        torch.Size([2, 5])
+
+    Args:
+        warp: of `look_at`, or any other whose target is the camera of the crop, such as `ct.Warp(camera,
+            camera.crop(top, left, height, width))`.
+
+    Returns:
+        (*B, 5), with gradients: the unit ray of the crop's middle in the frame of the source (x right, y down, z
+        forward), then the tangents of half the angles between left and right, and between top and bottom: half of width
+        and height over the focal length. If the rotation mirrors, the ray is that of the scene in a mirror, x negated.
+        Where the target has no ray in the middle or at a side, what follows from it is 0.
+
+    Raises:
+        TypeError: If warp is no warp.
+    """
+    if not isinstance(warp, Warp):
+        raise TypeError(
+            f"crop_place: warp must be a Warp, as of ct.views.look_at; got {shown(warp)}. BoxCrop(place=True) has the "
+            "place of a sample's crop"
+        )
+    return place_of(warp.target, warp.rotation)
+
+
+def place_of(camera: Camera, rotation: Tensor | None) -> Tensor:
+    """Return the place (*B, 5) of the images of a camera turned by a rotation (*B, 3, 3); see `crop_place`."""
+    right, down = camera.width - 0.5, camera.height - 0.5
+    x, y = (right - 0.5) / 2, (down - 0.5) / 2
+    ends = camera.intrinsics.new_tensor([[x, y], [-0.5, y], [right, y], [x, -0.5], [x, down]])
+    rays, seen = camera.unproject(ends.expand(*camera.batch_shape, 5, 2))
+    rays = torch.where(seen.unsqueeze(-1), rays, 0.0)
+    middle, starts, stops = rays[..., 0, :], rays[..., 1::2, :], rays[..., 2::2, :]
+    apart, along = (stops - starts).square().sum(-1), (stops + starts).square().sum(-1)
+    known = seen[..., 1::2] & seen[..., 2::2] & (apart > 0) & (along > 0)
+    tangents = torch.where(known, apart / torch.where(known, along, 1.0), 1.0).sqrt() * known
+    if rotation is not None:
+        middle = (rotation * middle.unsqueeze(-1)).sum(-2)
+        first, second, third = rotation.unbind(-2)
+        mirrors = (torch.linalg.cross(first, second) * third).sum(-1, keepdim=True) < 0
+        middle = torch.where(mirrors, middle * middle.new_tensor([-1.0, 1.0, 1.0]), middle)
+    return torch.cat((middle, tangents.to(middle).expand(*middle.shape[:-1], 2)), -1)
 
 
 def as_margin(value: object, owner: str) -> float:
@@ -250,40 +316,74 @@ def pinhole(intrinsics: Tensor, size: tuple[int, int]) -> Pinhole:
 
 
 def _refuse(wrong: Tensor, boxes: Tensor, what: str, owner: str) -> None:
-    """Raise a ValueError that names the first of `boxes` (B, 4) at which `wrong` (B,) is True, if there is one."""
+    """Raise a ValueError that names the first of `boxes` (*B, 4) at which `wrong`, in their order, is True."""
     if bool(wrong.any()):
-        i = int(wrong.nonzero()[0])
-        raise ValueError(f"{owner}: boxes must {what}; got boxes[{i}] = {boxes[i].tolist()}")
+        i = int(wrong.flatten().nonzero()[0])
+        place = ", ".join(str(int(n)) for n in np.unravel_index(i, boxes.shape[:-1]))
+        raise ValueError(f"{owner}: boxes must {what}; got boxes[{place}] = {boxes.reshape(-1, 4)[i].tolist()}")
 
 
-@torch.no_grad()
 def looking_at(
     camera: Camera, boxes: Tensor, size: tuple[int, int], margin: float, owner: str
 ) -> tuple[Tensor, Tensor]:
-    """Return intrinsics (B, 4) and rotations (B, 3, 3), in float64, of the cameras of `look_at` for boxes (B, 4)."""
-    check_boxes(boxes, "boxes", owner)
-    _refuse(~torch.isfinite(boxes).all(-1), boxes, "be finite", owner)
-    _refuse(~(boxes[:, :2] < boxes[:, 2:]).all(-1), boxes, "have a width and a height: x1 < x2 and y1 < y2", owner)
-    limits = boxes.new_tensor((camera.width, camera.height)) - 0.5
-    is_shown = ((boxes[:, :2] < limits) & (boxes[:, 2:] > -0.5)).all(-1)
-    _refuse(~is_shown, boxes, f"be on the image, {camera.width} x {camera.height}, in part", owner)
-    low, high = boxes.detach().double().split(2, -1)
-    axis, has_ray = camera.unproject((low + high) / 2)
-    _refuse(~has_ray, boxes, "have a middle that the lens sees", owner)
+    """Return intrinsics (*B, 4) and rotations (*B, 3, 3), in float64, of the cameras of `look_at` for boxes (*B, 4).
+
+    camera: a single one, or one for each box, with one batch dim. Derivatives go to the boxes.
+    """
+    farthest, rotation, touching = _outermost(camera, boxes, margin, owner)
+    if keeps_graph(boxes) or has_tangent(boxes):
+        # the largest slope of all has the derivative of the slope at the point that has it
+        camera = camera.detach() if keeps_graph(*camera.tensors) else camera
+        low, high = boxes.reshape(-1, 4).double().split(2, -1)
+        rotation = _rotation_to(camera.unproject((low + high) / 2)[0])
+        moved = margin * (high - low)
+        edges, shares = touching
+        corners = corners_of(torch.cat((low - moved, high + moved), -1))
+        rows = torch.arange(len(corners), device=corners.device)[:, None]
+        start, end = corners[rows, edges], corners[rows, (edges + 1) % 4]
+        rays = camera.unproject(start + shares[..., None] * (end - start))[0] @ rotation.mT
+        farthest = rays[..., :2].diagonal(dim1=1, dim2=2).abs() / rays[..., 2]
+    sides = farthest.new_tensor(size[::-1])
+    focal = (sides / 2 / farthest).amin(-1, keepdim=True).expand(-1, 2)
+    intrinsics = torch.cat((focal, ((sides - 1) / 2).expand_as(focal)), -1)
+    return intrinsics.view(*boxes.shape[:-1], 4), rotation.view(*boxes.shape[:-1], 3, 3)
+
+
+def _rotation_to(axis: Tensor) -> Tensor:
+    """Return rotations (B, 3, 3) to cameras that look along unit rays (B, 3), with the y axis in their y-z plane."""
     axis = axis / axis.norm(dim=-1, keepdim=True)
     across = torch.stack((axis[:, 2], torch.zeros_like(axis[:, 0]), -axis[:, 0]), -1)
-    length = across.norm(dim=-1, keepdim=True)
+    across = across / across.norm(dim=-1, keepdim=True)
+    return torch.stack((across, torch.linalg.cross(axis, across), axis), -2)
+
+
+@torch.no_grad()
+def _outermost(
+    camera: Camera, boxes: Tensor, margin: float, owner: str
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+    """Return the largest slopes (B, 2) of the outlines of boxes in the cameras of `look_at`, and their rotations.
+
+    And where they are, (B, 2) each: the edge, and the share of it from its start.
+    """
+    check_boxes(boxes, "boxes", owner)
+    _refuse(~torch.isfinite(boxes).all(-1), boxes, "be finite", owner)
+    _refuse(~(boxes[..., :2] < boxes[..., 2:]).all(-1), boxes, "have a width and a height: x1 < x2 and y1 < y2", owner)
+    limits = boxes.new_tensor((camera.width, camera.height)) - 0.5
+    is_shown = ((boxes[..., :2] < limits) & (boxes[..., 2:] > -0.5)).all(-1)
+    _refuse(~is_shown, boxes, f"be on the image, {camera.width} x {camera.height}, in part", owner)
+    low, high = boxes.detach().reshape(-1, 4).double().split(2, -1)
+    axis, has_ray = camera.unproject((low + high) / 2)
+    _refuse(~has_ray, boxes, "have a middle that the lens sees", owner)
     what = "lie off the camera's y axis, along which no direction is up"
-    _refuse(length[:, 0] < _STRAIGHT_UP, boxes, what, owner)
-    across = across / length
-    rotation = torch.stack((across, torch.linalg.cross(axis, across), axis), -2)
+    _refuse(axis[:, ::2].norm(dim=-1) < _STRAIGHT_UP * axis.norm(dim=-1), boxes, what, owner)
+    rotation = _rotation_to(axis)
     moved = margin * (high - low)
     corners = corners_of(torch.cat((low - moved, high + moved), -1))
     start, edge = corners[:, :, None, None], (corners.roll(-1, 1) - corners)[:, :, None, None]
     # find the largest slopes x / z and y / z along each edge, in smaller and smaller steps
     steps = torch.linspace(-1, 1, _ALONG, dtype=low.dtype, device=low.device)
-    place, half, all_seen = low.new_full((len(boxes), 4, 1), 0.5), 0.5, True
-    farthest = low.new_full((len(boxes), 2), -math.inf)
+    place, half, all_seen = low.new_full((len(low), 4, 1), 0.5), 0.5, True
+    farthest = low.new_full((len(low), 2), -math.inf)
     for i in range(_MORE_ROUNDS):
         share = (place[..., None] + half * steps).clamp(0, 1)  # (B, 4, 1 or 2, K)
         rays, seen = camera.unproject((start + share[..., None] * edge).flatten(1, 3))
@@ -296,10 +396,9 @@ def looking_at(
         slopes = slopes.expand(-1, -1, 2, -1, -1).diagonal(dim1=2, dim2=4).mT  # (B, 4, 2, K)
         best, index = slopes.max(-1)
         farthest = torch.maximum(farthest, best.amax(1))
+        place, half = share.expand(*best.shape, -1).gather(-1, index[..., None])[..., 0], 2 * half / (_ALONG - 1)
         if i == _ROUNDS - 1 and all_seen:
             break
-        place, half = share.expand(*best.shape, -1).gather(-1, index[..., None])[..., 0], 2 * half / (_ALONG - 1)
     _refuse(~torch.isfinite(farthest).all(-1), boxes, "have an outline that the lens sees", owner)
-    sides = farthest.new_tensor(size[::-1])
-    focal = (sides / 2 / farthest).amin(-1, keepdim=True).expand(-1, 2)
-    return torch.cat((focal, ((sides - 1) / 2).expand_as(focal)), -1), rotation
+    edges = best.argmax(1)
+    return farthest, rotation, (edges, place.gather(1, edges[:, None])[:, 0])
