@@ -100,7 +100,7 @@ class Transform(FrontEnd, A.DualTransform):
         def write(moved: Sample) -> Sample:
             change = self.augmentation.last
             assert change is not None  # set by the call that moved
-            result = data | {name: moved[name] for name in ("camera",) if name in moved}
+            result = data | {name: moved[name] for name in ("camera", "crop_place") if name in moved}
             for field, (name, target) in places.items():
                 seen = moved.get(f"{field}_valid")
                 result[name] = _taken(target, data[name], moved[field], seen, change.parts[0].image_size)

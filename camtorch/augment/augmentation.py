@@ -15,6 +15,7 @@ from camtorch.augment.change import Change, Part, alone, as_one, by_kinds, check
 from camtorch.augment.devices import Elsewhere, remember_camera, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, Named, as_corners
 from camtorch.augment.filling import enough, filled, scaled
+from camtorch.augment.place import PLACE, put_place
 from camtorch.augment.ranges import Range, draw
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
@@ -88,6 +89,8 @@ class Augmentation(SampleTransform):
     """Of what comes out; None: that of what comes in."""
     drawn_on_host: bool = False
     """Whether it makes new cameras of the numbers of others alone, so that the CPU does for samples on any device."""
+    place: bool = False
+    """Whether `crop_place` comes out; see `BoxCrop`."""
     crops: Mapping[str, int] = MappingProxyType({})
     """Boxes that a draw needs, by their names in it: which of each sample's."""
     p: float
@@ -384,6 +387,8 @@ class Augmentation(SampleTransform):
             if count and not self._calls.warned and "image" in plan.fields.values():
                 self.tell_of_empty_images(change.host.source if isinstance(change, Elsewhere) else camera)
         moved = self._moved(sample, batch, change)
+        if self.place or PLACE in sample:
+            put_place(sample, moved, self._name)
         if isinstance(change, Elsewhere) and isinstance(moved.get("camera"), Camera):
             remember_camera(moved["camera"], change.host.target if plan.batched else change.host.single)
         return moved, change
@@ -422,7 +427,9 @@ class Augmentation(SampleTransform):
                 f"{self._name}: camera and rotation of the sample must be those that this change made; got "
                 f"{sample['camera']!r:.60}. If the sample is of another call, pass its draw= and the camera= before it"
             )
-        return self.moved_by(change.inverse(), sample, predicted=True)
+        moved = self.moved_by(change.inverse(), sample, predicted=True)
+        moved.pop(PLACE, None)  # what comes back is no crop
+        return moved
 
     def _of_sample(self, draw: Mapping[str, Any], rows: Callable[[], Named]) -> Mapping[str, Any]:
         """Add to a draw the boxes that it needs of a sample: those named `boxes`, or the first of that kind."""

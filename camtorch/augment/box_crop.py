@@ -12,7 +12,7 @@ from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.ranges import RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.poses.rotations import mount_rotation
-from camtorch.values.arguments import as_known_size, as_whole
+from camtorch.values.arguments import as_flag, as_known_size, as_whole
 from camtorch.warp.views import as_margin, looking_at, pinhole
 
 
@@ -22,7 +22,8 @@ class BoxCrop(Augmentation):
     Landmarks, other boxes, masks, depth, gaze, head pose and the camera move too, and `inverse` moves them back. A draw
     holds the boxes as `draw["box"]` (B, 4), which `forward` takes from the sample's boxes; for `change`, and for the
     first of several calls of a replay, put them there. In a `Compose` the box moves with the parts before. If it left
-    the image, the crop shows the middle of the image, and the labels are invalid.
+    the image, the crop shows the middle of the image, and the labels are invalid. Gradients go to boxes that require
+    grad. A sample has one crop: for all F boxes of each image, `ct.views.look_at` takes (B, F, 4).
 
         >>> crop = ct.augment.BoxCrop((64, 64), camera=ct.Pinhole([80.0, 80.0, 63.5, 47.5], image_size=(96, 128)))
         >>> crop(image=torch.zeros(3, 96, 128), boxes=torch.tensor([[40.0, 30.0, 70.0, 60.0]]))["image"].shape
@@ -32,6 +33,9 @@ class BoxCrop(Augmentation):
         image_size: (height, width) of the crop.
         margin: how far left and right move out, in widths of the box, and top and bottom, in heights.
         index: index of the box among those of a sample; -1 is the last one.
+        place: whether `crop_place` (B, 5) comes out, for the network: the ray of the crop's middle in the frame of the
+            first camera and the tangents of its half angles; see `ct.views.crop_place`. Later augmentations renew it,
+            by the sample's `camera` and `rotation`.
         yaw, pitch, roll: ranges of degrees by which the camera turns away from the box, as in `RandomMount`.
         zoom: range of the factor on the focal length; below 1 more than box and margin is shown.
         options: see `Augmentation`.
@@ -51,6 +55,7 @@ class BoxCrop(Augmentation):
         *,
         margin: float = 0.25,
         index: int = 0,
+        place: bool = False,
         yaw: RangeLike | None = None,
         pitch: RangeLike | None = None,
         roll: RangeLike | None = None,
@@ -64,7 +69,13 @@ class BoxCrop(Augmentation):
             ranges["zoom"] = as_range(zoom, "zoom", name, around=1, least=1e-3, most=1e3)
         super().__init__(ranges, min_filled=0, **options)  # a box at the rim of the image is intended
         self.image_size, self.margin = as_known_size(image_size, name), as_margin(margin, name)
+        if isinstance(index, (list, tuple)):
+            raise TypeError(
+                f"{name}: index must be a whole number; got {index!r}. F boxes of each sample go in flattened, as "
+                "image.repeat_interleave(F, 0) and boxes.flatten(0, 1)[:, None]; ct.views.look_at takes boxes (B, F, 4)"
+            )
         self.crops = {"box": as_whole(index, "index", name)}
+        self.place = as_flag(place, "place", name)
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """Return the camera that looks at `values["box"]`, (*B, 4), and its rotation; see `Augmentation.new_camera`."""
@@ -82,5 +93,5 @@ class BoxCrop(Augmentation):
         return pinhole(intrinsics.to(box), self.image_size), rotation.to(box)
 
     def extra_repr(self) -> str:
-        own = f"image_size={self.image_size}, margin={self.margin:g}, index={self.crops['box']}"
+        own = f"image_size={self.image_size}, margin={self.margin:g}, index={self.crops['box']}, place={self.place}"
         return f"{own}, {super().extra_repr()}"

@@ -42,8 +42,16 @@ class Clips:
         if not hasattr(value, "__len__") or (isinstance(value, Camera) and not value.batch_shape):
             return value
         clips, frames = self.shape
-        if len(value) != clips:
-            raise ValueError(f"{self.owner}: {name} must be of {clips} clips, as {self.image} is; got {len(value)}")
+        several = isinstance(value, Camera) and len(value.batch_shape) > 1
+        if len(value) != clips or several:
+            got = tuple(value.batch_shape) if several else len(value)
+            flat = "ct.cat(list(camera))" if several else "camera, one for each"
+            hint = (
+                f". Images (B, N, C, H, W) of N cameras each go in flattened to (B N): {self.image}.flatten(0, 1) and "
+            )
+            hint += f"labels likewise, camera={flat}; results by .unflatten(0, {self.shape})"
+            hint = hint if name == "camera" else ""
+            raise ValueError(f"{self.owner}: {name} must be of {clips} clips, as {self.image} is; got {got}{hint}")
         rows = [i for i in range(clips) for _ in range(frames)]
         return [value[i] for i in rows] if isinstance(value, (list, tuple)) else value[rows]
 
@@ -51,7 +59,7 @@ class Clips:
         """Return moved frames as clips; values of a whole clip, such as its camera, are returned once."""
         result = dict(moved)
         for name, value in moved.items():
-            if name in ("camera", "rotation"):
+            if name in ("camera", "rotation", "crop_place"):
                 rows = list(range(0, len(value), self.shape[1]))
                 result[name] = [value[i] for i in rows] if isinstance(value, list) else value[rows]
             elif value is not self.sample.get(name):

@@ -133,6 +133,11 @@ class Compose(Augmentation):
         return any(part.needs_camera for part in self.parts)
 
     @property
+    def place(self) -> bool:  # type: ignore[override]
+        """Whether a part adds `crop_place`: that of the new image, seen from the first camera."""
+        return any(part.place for part in self.parts)
+
+    @property
     def drawn_on_host(self) -> bool:  # type: ignore[override]
         """See `Augmentation`; whether all parts are."""
         return all(part.drawn_on_host for part in self.parts)

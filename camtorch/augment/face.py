@@ -11,6 +11,7 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.change import Change, Part, alone
+from camtorch.augment.place import PLACE
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import known_false
@@ -146,6 +147,7 @@ class FaceNormalizer(SampleTransform):
             raise ValueError(f"{self._name}: a sample must have head_pose, or rvec and tvec; got {', '.join(sample)}")
         centre = kinds.get("face_center", centre)
         moved = self._moved(sample, batch, self.change(camera, head, centre))
+        moved.pop(PLACE, None)
         scale = self.distance / centre.norm(dim=-1)
         moved["scale"] = scale if batch.plan.batched else scale.squeeze(0)
         moved["source_camera"] = camera.clone()
@@ -171,6 +173,7 @@ class FaceNormalizer(SampleTransform):
         warp = Warp(source, normal, rotation.to(normal.intrinsics), **self.options)
         moved = self._moved(sample, batch, Change(batch.plan.count, [Part(None, warp, source)]).inverse())
         del moved["rotation"]
+        moved.pop(PLACE, None)
         if before is not None:
             moved["rotation"] = moved.pop("source_rotation")
         return moved

@@ -20,6 +20,7 @@ from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.fields import ALIASES, IMAGES, KINDS, OWN, kind_of
 from camtorch.augment.front_end import FrontEnd, check_front_end
+from camtorch.augment.place import PLACE
 from camtorch.augment.sample import Sample, Single
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
@@ -128,7 +129,7 @@ class Transform(FrontEnd):
                 if tensors[name].keys() <= moved.keys()  # a face is moved back without its rotation
             }
             for name, value in moved.items():
-                if name not in given:
+                if name not in given or name == PLACE:
                     value = plain(value) if isinstance(value, Tensor) else value
                     result[name] = value[0] if name.endswith(_VALID) and value.ndim == 3 else value
             return result
@@ -149,7 +150,7 @@ class Transform(FrontEnd):
         return {name: self._way(name, value, sample, size) for name, value in sample.items()}
 
     def _way(self, name: str, value: Any, sample: Mapping[str, Any], size: tuple[int, int] | None) -> Way:
-        kind = None if name in OWN or value is None else self._kind(name, value, sample)
+        kind = None if name in (*OWN, PLACE) or value is None else self._kind(name, value, sample)
         mirroring = self.augmentation.mirroring
         if kind is None and (mirroring is None or name not in mirroring.by_name):
             return lambda given: {name: given}, lambda moved, given: moved[name]

@@ -38,6 +38,7 @@ from camtorch.augment.fields import (
     warn_of_numbers,
 )
 from camtorch.augment.landmarks import Mirroring, exchanged
+from camtorch.augment.place import PLACE
 from camtorch.augment.plan import Batch, Plan
 from camtorch.augment.ranges import Spans
 from camtorch.cameras.camera import Camera
@@ -295,7 +296,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         else:
             return None
         fields = {**self.fields, **(kinds or {})}
-        given = {name: value for name, value in sample.items() if name not in OWN and value is not None}
+        given = {name: value for name, value in sample.items() if name not in (*OWN, PLACE) and value is not None}
         found = {name: kind_of(name, value, fields, self._name) for name, value in given.items()}
         images = [name for name, kind in found.items() if kind == "image" and getattr(given[name], "ndim", 0) == 5]
         if not images:
@@ -309,7 +310,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         """Return the fields that move."""
         named: Named = {}
         for name, value in sample.items():
-            if name in OWN or value is None:
+            if name in OWN or name == PLACE or value is None:
                 continue
             found = kind_of(name, value, fields, self._name, single)
             if found is not None and isinstance(value, (list, tuple)):
@@ -421,8 +422,9 @@ class SampleTransform(KeepsCamera, nn.Module):
             name = f"camera[{i}]" if several else "camera"
             shape = tuple(as_sized(one, name, self._name).batch_shape)
             if shape not in ((), (1,), (count,)) or (shape and len(cameras) > 1):
+                hint = f". Flatten cameras (B, N) to (B N): {name}=ct.cat(list(camera))" if len(shape) == 2 else ""
                 raise ValueError(
-                    f"{self._name}: {name} must have no batch dims, or those of {count} samples; got {shape}"
+                    f"{self._name}: {name} must have no batch dims, or those of {count} samples; got {shape}{hint}"
                 )
             for field, value in images:
                 shapes = [v.shape for v in value] if isinstance(value, list) else [value.shape]

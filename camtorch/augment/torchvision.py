@@ -20,6 +20,7 @@ from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
 from camtorch.augment.fields import IMAGES, KEEP, KINDS, OWN, as_tensor, kind_of, pattern_of
 from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
+from camtorch.augment.place import PLACE
 from camtorch.augment.sample import Frames, Sample, detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
@@ -125,6 +126,8 @@ class Transform(FrontEnd, v2.Transform):
             for i in cameras:
                 leaves[i] = moved["camera"]
             result = pytree.tree_unflatten(leaves, spec)
+            if self.augmentation.place and isinstance(result, dict):
+                result[PLACE] = moved[PLACE]
             for i in fields if self.valid else ():
                 path, valid = paths[i], moved.get(f"{keys[i]}_valid")
                 if valid is not None and path and isinstance(path[-1], pytree.MappingKey):

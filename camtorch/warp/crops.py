@@ -13,7 +13,6 @@ from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import keeps_graph
 from camtorch.evaluate.kept import Kept
 from camtorch.values.arguments import Numbers, as_values
-from camtorch.warp import plan
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.grid import Sampling
 from camtorch.warp.sampling import Fill, Mode, PaddingMode, as_options, render
@@ -54,7 +53,7 @@ class CropsWarp(Warp):
     ):
         """Make it of valid cameras, single, (B,) or (B, F), and rotations (B, F, 3, 3)."""
         options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
-        self._set(source, target, options, rotation.shape[:-2])
+        self.set_up(source, target, options, rotation.shape[:-2])
         self.turned_by(rotation)
         self._rows = Kept()
 
@@ -67,7 +66,7 @@ class CropsWarp(Warp):
             rotation = cast("Tensor", self.rotation).flatten(0, 1)
             return Warp.unchecked(source, target, self.options).turned_by(rotation)
 
-        return self._rows.unless_learning(self._inputs(), (*self._options, *self.options.values()), made)
+        return self._rows.unless_learning(self.tensors, (*self.form, *self.options.values()), made)
 
     def forward(
         self,
@@ -95,11 +94,10 @@ class CropsWarp(Warp):
             return torch.unflatten(made, 0, batch)  # type: ignore[return-value]  # the images are a tensor
         sampler = checked(rows, images[:1], mode, padding_mode, fill)
         # the crops of an image are sampled as one, the first on top
-        where = plan.by_pixel(rows)
+        where = rows.by_pixel()
         parts = [None if part is None else part.unflatten(0, batch).flatten(1, 2) for part in where]
-        made = render(plan.lengthened(rows, images), Sampling(*parts), *sampler)  # type: ignore[arg-type]
-        made = torch.unflatten(made, 2, (batch[1], -1)).movedim(2, 1).contiguous()
-        return made  # type: ignore[return-value]
+        made = render(rows.lengthened(images), Sampling(*parts), *sampler)  # type: ignore[arg-type]
+        return torch.unflatten(made, 2, (batch[1], -1)).movedim(2, 1).contiguous()  # type: ignore[return-value]
 
     def strips(self, *args: Any, **options: Any) -> Iterator[Any]:
         """Raise: `warp.by_rows`, a warp for images (B * F, C, H, W), has strips."""
@@ -115,7 +113,7 @@ class CropsWarp(Warp):
 
     def pin(self) -> Warp:
         """Compute the grid now, unless it learns; return the warp."""
-        if not keeps_graph(*self._inputs()):
+        if not keeps_graph(*self.tensors):
             self.by_rows.pin()
         return self
 

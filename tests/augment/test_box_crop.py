@@ -154,3 +154,54 @@ def test_kornia_crops_the_same():
         aug(images, params=params)
     moved = aug(images, params=kornia.with_boxes(params, boxes[None, 0]))
     torch.testing.assert_close(moved, ct.augment.BoxCrop(SIZE)(image=images, boxes=boxes[None], camera=camera)["image"])
+
+
+def test_the_place_of_the_crop_is_a_field():
+    camera, A = fisheye(torch.float64), ct.augment  # noqa: N806
+    sample, crop = sample_of(camera), A.BoxCrop(SIZE, yaw=3, zoom=0.1, place=True)
+    out = crop(sample, camera=camera)
+    want = ct.views.crop_place(ct.Warp(camera, out["camera"], out["rotation"]))
+    torch.testing.assert_close(out["crop_place"], want)
+    flip = A.HorizontalFlip(p=1)
+    mirror = torch.tensor([-1.0, 1, 1, 1, 1], dtype=torch.float64)
+    torch.testing.assert_close(flip(out)["crop_place"], want * mirror)
+    assert "crop_place" not in crop.inverse(out)
+    with pytest.raises(ValueError, match="crop_place must have the rotation"):
+        flip({name: value for name, value in out.items() if name != "rotation"})
+    torch.manual_seed(0)
+    chain = A.Compose([A.BoxCrop(SIZE, place=True), flip], camera=camera)
+    alone = chain({name: value[0] for name, value in sample.items()})
+    torch.testing.assert_close(chain(sample)["crop_place"][0], alone["crop_place"])
+    arrays = A.numpy.Transform(chain)({name: value[0].numpy() for name, value in sample.items()})
+    np.testing.assert_allclose(arrays["crop_place"], alone["crop_place"].numpy())
+    assert A.collate([alone, alone])["crop_place"].shape == (2, 5)
+
+
+def test_gradients_reach_the_boxes_of_samples():
+    camera = fisheye(torch.float64)
+    sample, crop = sample_of(camera), ct.augment.BoxCrop(SIZE, place=True, camera=camera)
+
+    def of(boxes):
+        out = crop({**sample, "boxes": boxes})
+        return out["keypoints"].square().mean() + out["gaze"][:, 0].sum() + out["crop_place"].square().sum()
+
+    boxes = sample["boxes"].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(of(boxes), boxes)
+    step = torch.zeros_like(boxes.detach())
+    step[1, 0, 2] = 1e-5
+    number = (of(boxes.detach() + step) - of(boxes.detach() - step)) / 2e-5
+    torch.testing.assert_close(gradient[1, 0, 2], number, rtol=1e-3, atol=1e-6)
+    with pytest.raises(TypeError, match=r"repeat_interleave\(F, 0\)"):
+        ct.augment.BoxCrop(SIZE, index=[0, 1])
+
+
+def test_several_cameras_of_a_sample_are_flattened():
+    camera, images = fisheye(), torch.zeros(2, 3, 1, 480, 640)
+    mount = ct.augment.RandomMount(yaw=2)
+    for cameras, way in ((camera.expand(2, 3), r"ct\.cat\(list\(camera\)\)"), (camera.expand(6), "one for each")):
+        with pytest.raises(ValueError, match=rf"flattened to \(B N\): image\.flatten\(0, 1\).*{way}"):
+            mount(image=images, camera=cameras)
+    with pytest.raises(ValueError, match=r"Flatten cameras \(B, N\).*ct\.cat"):
+        mount(image=images.flatten(0, 1), camera=camera.expand(2, 3))
+    out = mount(image=images.flatten(0, 1), camera=ct.cat(list(camera.expand(2, 3))))
+    assert out["image"].unflatten(0, (2, 3)).shape == images.shape
