@@ -330,8 +330,9 @@ def looking_at(
 
     camera: a single one, or one for each box, with one batch dim. Derivatives go to the boxes.
     """
-    farthest, rotation, touching = _outermost(camera, boxes, margin, owner)
-    if keeps_graph(boxes) or has_tangent(boxes):
+    learns = keeps_graph(boxes) or has_tangent(boxes)
+    farthest, rotation, touching = _outermost(camera, boxes, margin, owner, learns)
+    if touching is not None:
         # the largest slope of all has the derivative of the slope at the point that has it
         camera = camera.detach() if keeps_graph(*camera.tensors) else camera
         low, high = boxes.reshape(-1, 4).double().split(2, -1)
@@ -359,11 +360,11 @@ def _rotation_to(axis: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _outermost(
-    camera: Camera, boxes: Tensor, margin: float, owner: str
-) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+    camera: Camera, boxes: Tensor, margin: float, owner: str, learns: bool
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
     """Return the largest slopes (B, 2) of the outlines of boxes in the cameras of `look_at`, and their rotations.
 
-    And where they are, (B, 2) each: the edge, and the share of it from its start.
+    And, if the boxes learn, where they are, (B, 2) each: the edge, and the share of it from its start.
     """
     check_boxes(boxes, "boxes", owner)
     _refuse(~torch.isfinite(boxes).all(-1), boxes, "be finite", owner)
@@ -396,9 +397,14 @@ def _outermost(
         slopes = slopes.expand(-1, -1, 2, -1, -1).diagonal(dim1=2, dim2=4).mT  # (B, 4, 2, K)
         best, index = slopes.max(-1)
         farthest = torch.maximum(farthest, best.amax(1))
+        is_last = i == _MORE_ROUNDS - 1 or (i == _ROUNDS - 1 and all_seen)
+        if is_last and not learns:
+            break
         place, half = share.expand(*best.shape, -1).gather(-1, index[..., None])[..., 0], 2 * half / (_ALONG - 1)
-        if i == _ROUNDS - 1 and all_seen:
+        if is_last:
             break
     _refuse(~torch.isfinite(farthest).all(-1), boxes, "have an outline that the lens sees", owner)
+    if not learns:
+        return farthest, rotation, None
     edges = best.argmax(1)
     return farthest, rotation, (edges, place.gather(1, edges[:, None])[:, 0])

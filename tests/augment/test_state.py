@@ -69,6 +69,7 @@ VALUES = {
     "like": LIKE.replace(image_size=(96, 128)),
     "image_size": (40, 36),
     "margin": 0.5,
+    "place": True,
     "crops": {"box": 1},
     "direction": "up",
     "times": (1, 1, 1),
