@@ -157,7 +157,7 @@ def test_kornia_crops_the_same():
 
 
 def test_the_place_of_the_crop_is_a_field():
-    camera, A = fisheye(torch.float64), ct.augment  # noqa: N806
+    camera, A = wide(dtype=torch.float64), ct.augment  # noqa: N806
     sample, crop = sample_of(camera), A.BoxCrop(SIZE, yaw=3, zoom=0.1, place=True)
     out = crop(sample, camera=camera)
     want = ct.views.crop_place(ct.Warp(camera, out["camera"], out["rotation"]))
@@ -178,7 +178,7 @@ def test_the_place_of_the_crop_is_a_field():
 
 
 def test_gradients_reach_the_boxes_of_samples():
-    camera = fisheye(torch.float64)
+    camera = wide(dtype=torch.float64)
     sample, crop = sample_of(camera), ct.augment.BoxCrop(SIZE, place=True, camera=camera)
 
     def of(boxes):
@@ -196,7 +196,7 @@ def test_gradients_reach_the_boxes_of_samples():
 
 
 def test_several_cameras_of_a_sample_are_flattened():
-    camera, images = fisheye(), torch.zeros(2, 3, 1, 480, 640)
+    camera, images = wide(), torch.zeros(2, 3, 1, 480, 640)
     mount = ct.augment.RandomMount(yaw=2)
     for cameras, way in ((camera.expand(2, 3), r"ct\.cat\(list\(camera\)\)"), (camera.expand(6), "one for each")):
         with pytest.raises(ValueError, match=rf"flattened to \(B N\): image\.flatten\(0, 1\).*{way}"):
