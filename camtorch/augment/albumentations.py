@@ -21,6 +21,7 @@ from camtorch.augment import numpy as arrays
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.fields import KINDS, kind_of
 from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
+from camtorch.augment.matrices import NAMES
 from camtorch.augment.sample import Sample, Unknown, detached
 from camtorch.cameras.camera import Camera
 
@@ -47,7 +48,8 @@ class Transform(FrontEnd, A.DualTransform):
 
     Args:
         augmentation: the augmentation to apply.
-        camera: for samples that hold none; default: the augmentation's. It is copied, and does not learn.
+        camera: for samples that hold none; default: the augmentation's. It is copied, and does not learn. A number is
+            for photographs of unknown cameras, see `Augmentation`.
         p: probability that a sample is augmented; default: the augmentation's.
 
     Raises:
@@ -58,10 +60,10 @@ class Transform(FrontEnd, A.DualTransform):
 
     _targets = (Targets.IMAGE, Targets.MASK, Targets.BBOXES, Targets.KEYPOINTS)
     augmentation: Augmentation
-    camera: Camera | None
+    camera: Camera | float | None
     _name = _OWNER
 
-    def __init__(self, augmentation: Augmentation, camera: Camera | None = None, p: float | None = None):
+    def __init__(self, augmentation: Augmentation, camera: Camera | float | None = None, p: float | None = None):
         check_front_end(_OWNER, augmentation)
         self.augmentation, self.camera, self._arrays = augmentation, camera, arrays.Transform(augmentation)
         super().__init__(p=augmentation.p if p is None else p)
@@ -69,7 +71,7 @@ class Transform(FrontEnd, A.DualTransform):
     @property
     def targets(self) -> dict[str, Callable[..., Any]]:
         nothing: Callable[..., Any] = self.apply  # `apply_with_params` moves all targets together
-        return dict.fromkeys((*KINDS, *_OWN, *self.augmentation.fields, "camera"), nothing)
+        return dict.fromkeys((*KINDS, *_OWN, *NAMES, *self.augmentation.fields, "camera"), nothing)
 
     def __call__(self, *args: Any, force_apply: bool = False, **data: Any) -> dict[str, Any]:
         """Transform a sample of keyword arguments; see the class."""
@@ -112,7 +114,15 @@ class Transform(FrontEnd, A.DualTransform):
 
     def _source(self, data: dict[str, Any]) -> Camera:
         sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]
-        return camera_of_sample(_OWNER, self.augmentation, data.get("camera", self.camera), sizes)
+        given = data.get("camera")
+        matrices = ((name, value) for name, value in data.items() if value is not None and self._is_matrix(name, value))
+        camera = self.camera if given is None else given
+        return camera_of_sample(_OWNER, self.augmentation, camera, sizes, next(matrices, None))
+
+    def _is_matrix(self, name: str, value: Any) -> bool:
+        name = self._additional_targets.get(name, name)
+        kinds = self.augmentation.fields
+        return (name in NAMES or "K" in kinds.values()) and kind_of(name, value, kinds, _OWNER, single=True) == "K"
 
 
 def _given(target: str, value: Any, camera: Camera) -> Any:

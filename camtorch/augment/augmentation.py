@@ -62,7 +62,9 @@ class Augmentation(SampleTransform):
     Args:
         ranges: name -> `Range`, in the order in which they are drawn.
         camera: of samples that do not bring one. The augmentation keeps a copy, which does not learn, nor follow later
-            changes of the camera.
+            changes of the camera. A number is for photographs of unknown cameras, of any size: each is taken for that
+            of a pinhole camera so many degrees wide, from edge to edge. Where there is no camera, a field `K` (or
+            `intrinsics`, `camera_matrix`) of a sample is the pinhole camera of the image, and comes before the number.
         p, same_on_batch: how likely a sample is augmented at all; the same draw for the whole batch.
         fields: name -> kind, for fields of other names; "keep" leaves one as it is. A * in a name stands for any
             characters, as in "observation.images.*"; of several that fit, the first counts.
@@ -182,11 +184,11 @@ class Augmentation(SampleTransform):
 
     def change(self, camera: Camera | Sequence[Camera] | None, draw: Mapping[str, Tensor]) -> Change:
         """Return the change that a draw makes to images of `camera` (None: the augmentation's own)."""
-        camera = self.camera if camera is None else camera
-        if camera is None:
+        own = self.camera if camera is None else camera
+        if own is None or isinstance(own, (int, float)):
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
-            raise ValueError(f"{self._name}: camera must be given; got None. Please {how}. {GUESS_CAMERA}")
-        return self._changed(alone(as_one(camera)), self._checked_draw(draw))
+            raise ValueError(f"{self._name}: camera must be given; got {own}. Please {how}. {GUESS_CAMERA}")
+        return self._changed(alone(as_one(own)), self._checked_draw(draw))
 
     def _changed(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         """Return the change of a draw, computed on the CPU if the draw is there and the camera elsewhere, unlearnt."""

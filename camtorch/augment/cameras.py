@@ -24,7 +24,7 @@ from camtorch.cameras.catalogue import ELSEWHERE
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_numbers, known_false, with_derivatives_of
 from camtorch.lenses.drawing import covering, drawn
-from camtorch.models import MODELS, KannalaBrandt
+from camtorch.models import MODELS, KannalaBrandt, Pinhole
 from camtorch.native.structs import AMOUNTS
 from camtorch.optics.radial_inverse import precise
 from camtorch.poses.rotations import mount_elements
@@ -121,6 +121,11 @@ class CameraDrawer(Augmentation):
         among = self.ranges.pop("fov", None) if self._is_real else None
         self._among = None if among is None else (among.low, among.high)
         self.like = None if self._is_real else like
+
+    @property
+    def makes_pinholes(self) -> bool:  # type: ignore[override]
+        """See `SampleTransform`."""
+        return not self._is_real and (self.like is None or isinstance(self.like, Pinhole))
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "fov" and value not in (None, "source"):

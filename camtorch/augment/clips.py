@@ -17,6 +17,7 @@ class Clips:
 
     sample: Mapping[str, Any]
     fields: Sequence[str]
+    whole: Sequence[str]  # names of those that hold one for each clip
     shape: tuple[int, ...]  # (B, T), that of `image`
     image: str
     owner: str
@@ -33,7 +34,8 @@ class Clips:
                     f"is of clips (B, T, ...); got {f'shape {shape}' if shape else type(value).__name__}"
                 )
             flat[name] = torch.as_tensor(value).flatten(0, 1)
-        for name, value in (("camera", camera), ("rotation", flat.get("rotation"))):
+        for name in self.whole:
+            value = camera if name == "camera" else flat.get(name)
             flat |= {} if value is None else {name: self.repeated(value, name)}
         return flat
 
@@ -59,7 +61,7 @@ class Clips:
         """Return moved frames as clips; values of a whole clip, such as its camera, are returned once."""
         result = dict(moved)
         for name, value in moved.items():
-            if name in ("camera", "rotation", "crop_place"):
+            if name in self.whole:
                 rows = list(range(0, len(value), self.shape[1]))
                 result[name] = [value[i] for i in rows] if isinstance(value, list) else value[rows]
             elif value is not self.sample.get(name):

@@ -138,6 +138,12 @@ class Compose(Augmentation):
         return any(part.place for part in self.parts)
 
     @property
+    def makes_pinholes(self) -> bool:  # type: ignore[override]
+        """See `SampleTransform`; whether all parts do, from the last crop of a box on."""
+        last = max((i for i, part in enumerate(self.parts) if part.crops and part.p == 1), default=0)
+        return all(part.makes_pinholes for part in self.parts[last:])
+
+    @property
     def drawn_on_host(self) -> bool:  # type: ignore[override]
         """See `Augmentation`; whether all parts are."""
         return all(part.drawn_on_host for part in self.parts)

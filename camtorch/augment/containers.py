@@ -23,6 +23,8 @@ from camtorch import augment
 from camtorch.augment.fields import OWN, is_text, kind_of
 from camtorch.augment.front_end import FrontEnd
 from camtorch.augment.kornia_parts import BasicAugmentationBase, ParamItem
+from camtorch.augment.matrices import Guess
+from camtorch.augment.matrices import camera_of as camera_by
 from camtorch.augment.sample import Sample, Single, detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import collate_cameras
@@ -164,16 +166,22 @@ def _with_fields(
     alone = image is not None and image.ndim < 4
     fields, kinds = _fields(self, sample, ours, alone)
     fields = Single(fields) if alone else fields
-    if camera is not None and len(ours) > 1:
+    name = next((n for n, kind in kinds.items() if kind == "K"), None)
+    matrix = None  # the camera of a field K
+    if name is not None and camera is None and image is not None and all(isinstance(o.camera, Guess) for o in ours):
+        value = fields[name].flatten(0, -3) if fields[name].ndim > 3 else fields[name]  # of the frames of videos
+        matrix = camera_by(name, value, (image.shape[-2], image.shape[-1]), type(self).__name__)
+    given = matrix if camera is None else camera
+    if given is not None and len(ours) > 1:
         raise ValueError(
             f"{type(self).__name__}: a camera must be that of one camera augmentation; got {len(ours)}. "
             "camtorch.augment.kornia.Compose makes one of several"
         )
-    if camera is not None and not back:
+    if given is not None and not back:
         if params is None and image is not None:
             dims = (3, 5) if self.contains_video_sequential else (2, 4)
             params = self.forward_parameters(self.autofill_dim(image, dim_range=dims)[1])
-        params = with_cameras(params, camera)
+        params = with_cameras(params, given)
     result = call(self, sample, params=params)
     applied = [*_parts(self._params if params is None else params, self)]
     for one, own in reversed(applied) if back else applied:

@@ -11,6 +11,7 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.change import Change, Part, alone
+from camtorch.augment.matrices import Guess
 from camtorch.augment.place import PLACE
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
@@ -134,7 +135,7 @@ class FaceNormalizer(SampleTransform):
         sample = self._given(sample, fields)
         batch = self._batch(sample)
         camera = batch.camera
-        if not isinstance(sample.get("camera", camera), Camera):
+        if not isinstance(sample.get("camera", camera), (Camera, Guess)):
             raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(sample['camera'])}")
         kinds = {name: value for name, (_, value) in batch.rows().items()}
         if listed := [n for n in ("head_pose", "rvec", "tvec", "face_center") if isinstance(kinds.get(n), list)]:

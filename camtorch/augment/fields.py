@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from camtorch.augment import matrices
 from camtorch.augment.change import Change
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import may_look, pytree
@@ -284,9 +285,11 @@ KINDS = {
         hint=_column_hint,
         way="columns",
     ),
+    "K": Field(2, 2, (3, 4), matrices.SHAPE, matrices.moved, True, matrices.hint, matrices.check),
 }
 BOXES = "boxes", *_PLACED
 ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
+ALIASES |= {name: "K" for name in matrices.NAMES if name != "K"}
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
 
 
@@ -310,9 +313,13 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single
     base = name if name in KINDS else ALIASES.get(name)
     if base is None and (pattern := pattern_of(name, own)) is not None:
         return None if own[pattern] == KEEP else own[pattern]
+    if base == "K":  # a number of things, or the path of a file, may be named so
+        array = isinstance(value, (Tensor, np.ndarray)) and value.ndim > 1
+        return base if array or _may_be_geometry(name, value, single) else None
     # image_path and mask_id, of a sample or a batch, are no images or masks
     if base is None and isinstance(value, (Tensor, np.ndarray, list, tuple)) and not is_text(value):
-        begins = sorted((k for k in KINDS if name.startswith(k + "_")), key=len)  # compilers do not know max with a key
+        # K_inv is no K; compilers do not know max with a key
+        begins = sorted((k for k in KINDS if name.startswith(k + "_") and k != "K"), key=len)
         base = begins[-1] if begins else None
     if base == "boxes" and (form := f"boxes_{name.rpartition('_')[2]}") in _PLACED:  # as boxes_face_xywh
         base = form
@@ -326,7 +333,7 @@ def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single
         meant = f"Did you mean {close[0]!r}? " if close else ""
         if _is_angle(name):
             meant = "A head's angles go in as head_pose, by ct.head_rotation(), a gaze's as pitch_yaw. "
-        if name in ("K", "intrinsics", "camera_matrix"):
+        if not {"K", "intrinsics", "matrix"}.isdisjoint(name.split("_")):
             meant = "A camera goes in as camera=, as ct.BrownConrady.from_matrix(K, D, image_size=(height, width)). "
         raise ValueError(
             f"{owner}: {name!r} must have a kind, by which its numbers move with the camera; got real numbers. {meant}"
@@ -422,7 +429,8 @@ def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> Non
         what = field.shape if batched else field.shape.replace("(B, ", "(")
         hint = f". {hint}" if (hint := field.hint(name, value, batched)) else _hint(name)
         raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{hint}")
-    if kind in ("head_pose", "pose") and value.shape[-2] not in (3, 4):
+    rows = (3, 4) if kind in ("head_pose", "pose") else value.shape[-1:]
+    if kind in ("head_pose", "pose", "K") and value.shape[-2] not in rows:
         raise ValueError(f"{owner}: {name} must be {field.shape}; got shape {tuple(value.shape)}")
 
 

@@ -7,6 +7,8 @@ from typing import Any
 
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
+from camtorch.augment.fields import as_tensor
+from camtorch.augment.matrices import Guess, camera_of
 from camtorch.augment.sample import KeepsCamera, SampleTransform, Unknown
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import GUESS_CAMERA, shown
@@ -20,6 +22,7 @@ class FrontEnd(KeepsCamera):
     """
 
     augmentation: Any
+    camera: Any  # of samples that bring none: a Camera, or degrees; None: that of the augmentation
 
     @property
     def last(self) -> Change | None:
@@ -52,13 +55,26 @@ def check_single(
 
 
 def camera_of_sample(
-    owner: str, augmentation: Augmentation, camera: object, sizes: Sequence[tuple[str, tuple[int, ...]]]
+    owner: str,
+    augmentation: Augmentation,
+    camera: object,
+    sizes: Sequence[tuple[str, tuple[int, ...]]],
+    matrix: tuple[str, Any] | None = None,
 ) -> Camera:
-    """Return the single camera of a sample whose images are of these sizes: given, the augmentation's, or unknown."""
-    camera = augmentation.camera if camera is None else camera
-    if camera is None and sizes and not augmentation.needs_camera:
+    """Return the single camera of a sample whose images are of these sizes: given, the augmentation's, or unknown.
+
+    matrix: name and value of a field K, which is the camera where there is no other.
+    """
+    own = augmentation.camera
+    camera = own if camera is None or (isinstance(camera, Guess) and isinstance(own, Camera)) else camera
+    if (camera is None or isinstance(camera, Guess)) and sizes:
         height, width = sizes[0][1]
-        camera = Unknown.of((height, width))
+        if matrix is not None:
+            camera = camera_of(matrix[0], as_tensor(matrix[1], matrix[0], "K", owner), (height, width), owner)
+        elif camera is not None:
+            camera = camera.camera((height, width))
+        elif not augmentation.needs_camera:
+            camera = Unknown.of((height, width))
     if not isinstance(camera, Camera):
         how = "give one here, in the sample, or to the augmentation"
         raise ValueError(f"{owner}: camera must be a Camera; got {shown(camera)}. Please {how}. {GUESS_CAMERA}")

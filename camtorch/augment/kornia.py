@@ -11,7 +11,7 @@ move the fields.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias, cast
 
 import torch
@@ -27,6 +27,7 @@ from camtorch.augment.change import Change
 from camtorch.augment.containers import KIND, Params, camera_of, kind_of_camera, with_boxes, with_cameras
 from camtorch.augment.front_end import FrontEnd, check_front_end, check_single
 from camtorch.augment.kornia_parts import transform_output_shape
+from camtorch.augment.matrices import Guess
 from camtorch.augment.sample import detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
@@ -47,7 +48,8 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     Args:
         augmentation: a `camtorch.augment.Augmentation`, for example a `RandomCamera`.
         camera: the Camera of the images, copied without gradients; default: the augmentation's. `with_cameras` gives
-            every sample its own, which may learn.
+            every sample its own, which may learn. A number is for photographs of unknown cameras, see `Augmentation`;
+            a `K` (B, 3, 3) in a dict, the matrix of the image, comes before it.
         p, p_batch: probability that a sample, and a batch, is augmented; the default of p is the augmentation's.
         same_on_batch: the same draw for the whole batch; default: as in the augmentation.
         keepdim: whether images without batch dim stay without.
@@ -70,12 +72,12 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     """
 
     augmentation: Augmentation
-    camera: Camera
+    camera: Camera | Guess
 
     def __init__(
         self,
         augmentation: Augmentation,
-        camera: Camera | None = None,
+        camera: Camera | float | None = None,
         *,
         p: float | None = None,
         p_batch: float = 1.0,
@@ -85,9 +87,10 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
         name = type(self).__name__
         check_front_end(name, augmentation)
         camera = augmentation.camera if camera is None else camera
-        if not isinstance(camera, Camera):
+        if isinstance(camera, (int, float)) and not isinstance(camera, (bool, Guess)):
+            camera = Guess.of(camera, name)
+        if not isinstance(camera, (Camera, Guess)):
             raise TypeError(f"{name}: camera must be the Camera of the images; got {no_camera(camera)}")
-        own_size = check_single(name, camera, (), ". with_cameras gives every sample its own")
         super().__init__(
             p=augmentation.p if p is None else as_part(p, "p", name, "probability"),
             p_batch=as_part(p_batch, "p_batch", name, "probability"),
@@ -97,17 +100,22 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
         self.augmentation, self.camera, options = augmentation, camera, augmentation.options
         self.flags: dict[str, Any] = {"resample": Resample.get(options["mode"]), "align_corners": False}
         self.flags["padding_mode"] = SamplePadding.get(options["padding_mode"])
-        if (size := augmentation.size_after(own_size)) != own_size:
-            self.flags["size"] = size
+        if isinstance(camera, Camera):
+            self._set_size(check_single(name, camera, (), ". with_cameras gives every sample its own"))
         self.keypoints_valid: Tensor | None = None
         """(B, N) bool: whether the keypoints that were moved last lie on their image."""
         # two memos: lists of masks are moved row by row between other labels of the batch
         self._memos = Kept(), Kept()
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        super().__setattr__(name, value)
-        if name == "camera":
-            self._kind = kind_of_camera(self.camera)
+    def _set_size(self, own_size: tuple[int, int]) -> None:
+        """Tell kornia the size of new images of a size."""
+        self.flags.pop("size", None)
+        if (size := self.augmentation.size_after(own_size)) != own_size:
+            self.flags["size"] = size
+
+    def camera_for(self, size: Sequence[int]) -> Camera:
+        """Return the camera of images of a size (height, width)."""
+        return self.camera.camera((int(size[0]), int(size[1]))) if isinstance(self.camera, Guess) else self.camera
 
     def set_rng_device_and_dtype(self, device: torch.device, dtype: torch.dtype) -> None:
         """Keep draws on the CPU: a seed then draws the same on every device, and reading params needs no wait."""
@@ -116,13 +124,16 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
         """Draw numbers as `Augmentation.draw` does after its gate; images must be of the camera's image_size."""
         count = batch_shape[0]
-        check_single(type(self).__name__, self.camera, [("images", tuple(batch_shape[-2:]))])
+        camera = self.camera_for(batch_shape[-2:])
+        if isinstance(self.camera, Guess):
+            self._set_size(cast("tuple[int, int]", camera.image_size))
+        check_single(type(self).__name__, camera, [("images", tuple(batch_shape[-2:]))])
         if count:
-            self.augmentation.tell_of_empty_images(self.camera)
+            self.augmentation.tell_of_empty_images(camera)
         drawn = self.augmentation.drawn(count, 1.0, self.same_on_batch)
         del drawn["apply"]
         drawn |= {name: torch.full((count, 4), torch.nan) for name in self.augmentation.crops}
-        drawn[KIND] = torch.tensor(self._kind).expand(count, -1).contiguous()
+        drawn[KIND] = torch.tensor(kind_of_camera(camera)).expand(count, -1).contiguous()
         if "size" in self.flags:
             drawn["output_size"] = torch.tensor(self.flags["size"]).expand(count, -1).contiguous()
         return drawn
@@ -130,16 +141,21 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     def change(self, params: Params | None = None, device: torch.device | None = None) -> Change:
         """Return the change by params, by default the last: `source`, `target`, `rotation`, `points(...)` and so on."""
         params = self._params if params is None else params
-        own = *self.augmentation.ranges, *self.augmentation.crops
-        if missing := [name for name in ("batch_prob", *own) if name not in params]:
+        ours = *self.augmentation.ranges, *self.augmentation.crops
+        if missing := [name for name in ("batch_prob", *ours) if name not in params]:
             raise ValueError(f"{type(self).__name__}: params must have {', '.join(missing)}; got none. Call it first")
-        values = {"apply": self._gate(params), **{name: params[name] for name in own}}
+        values = {"apply": self._gate(params), **{name: params[name] for name in ours}}
         if self.augmentation.crops and any(known_false(~values[name].isnan()) for name in self.augmentation.crops):
             raise ValueError(
                 f"{type(self).__name__}: params must hold boxes, as kornia passes boxes after images; got none. Use "
                 "params = aug.forward_parameters(images.shape), then aug(images, params=with_boxes(params, boxes))"
             )
-        camera = camera_of(params, self.camera, device)
+        own = self.camera
+        if isinstance(own, Guess):
+            own = self.camera_for(
+                (params[KIND][0] if len(params[KIND]) else params["forward_input_shape"])[-2:].tolist()
+            )
+        camera = camera_of(params, own, device)
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
         inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
         parts = [vars(part) for part in self.augmentation.modules()]
@@ -240,10 +256,11 @@ class _Random(CameraAugmentation):
 
     _wraps: Callable[..., Augmentation]
 
-    def __init__(self, *given: Any, camera: Camera | None = None, **options: Any):
+    def __init__(self, *given: Any, camera: Camera | float | None = None, **options: Any):
         name = type(self).__name__
         first, own = (given[0], given[1:]) if camera is None and given else (camera, given)
-        if not isinstance(first, Camera):
+        guess = first is camera and isinstance(first, (int, float)) and not isinstance(first, bool)
+        if not isinstance(first, Camera) and not guess:
             preset, got = (f", {first!r}", repr(first)) if isinstance(first, str) else ("", type(first).__name__)
             raise TypeError(
                 f"{name}: camera must be the Camera of the images and comes first: {name}(camera{preset}); got {got}"

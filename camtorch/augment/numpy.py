@@ -53,7 +53,8 @@ class Transform(FrontEnd):
 
     Args:
         augmentation: the augmentation to apply.
-        camera: for samples that hold none; default: the augmentation's. It is copied, and does not learn.
+        camera: for samples that hold none; default: the augmentation's. It is copied, and does not learn. A number is
+            for photographs of unknown cameras, see `Augmentation`.
 
     Raises:
         TypeError: If augmentation is no augmentation, or camera is no Camera.
@@ -61,9 +62,9 @@ class Transform(FrontEnd):
 
     _name = _OWNER
     augmentation: Augmentation | FaceNormalizer
-    camera: Camera | None
+    camera: Camera | float | None
 
-    def __init__(self, augmentation: Augmentation | FaceNormalizer, camera: Camera | None = None):
+    def __init__(self, augmentation: Augmentation | FaceNormalizer, camera: Camera | float | None = None):
         check_front_end(_OWNER, augmentation, Augmentation, FaceNormalizer)
         self.augmentation, self.camera, self._forms = augmentation, camera, Kept(16)
 
@@ -100,7 +101,7 @@ class Transform(FrontEnd):
         return f"Transform({self.augmentation!r})"
 
     def _read(
-        self, sample: Any, fields: Sample, otherwise: Camera | None = None
+        self, sample: Any, fields: Sample, otherwise: Camera | float | None = None
     ) -> tuple[Single, Callable[[Sample], Sample]]:
         """Return a sample as the augmentation takes it, and the function that writes a moved one as it was given."""
         if sample is not None and not isinstance(sample, Mapping):

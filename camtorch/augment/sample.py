@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Self, Unpack
 
+from camtorch.augment import matrices
 from camtorch.augment.change import Change, alone, as_one
 from camtorch.augment.clips import Clips
 from camtorch.augment.devices import remember_camera
@@ -38,6 +39,7 @@ from camtorch.augment.fields import (
     warn_of_numbers,
 )
 from camtorch.augment.landmarks import Mirroring, exchanged
+from camtorch.augment.matrices import Guess
 from camtorch.augment.place import PLACE
 from camtorch.augment.plan import Batch, Plan
 from camtorch.augment.ranges import Spans
@@ -92,7 +94,9 @@ class KeepsCamera:
     _name: str = ""  # in errors; empty: that of the class
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name == "camera" and not (value is None or isinstance(value, Camera)):
+        if name == "camera" and isinstance(value, (int, float)) and not isinstance(value, (bool, Guess)):
+            value = Guess.of(value, self._name or type(self).__name__)
+        if name == "camera" and not (value is None or isinstance(value, (Camera, Guess))):
             raise TypeError(f"{self._name or type(self).__name__}: camera must be a Camera; got {no_camera(value)}")
         if name in ("camera", "like") and isinstance(value, Camera):
             value = copy.deepcopy(value)
@@ -148,7 +152,7 @@ def detached(value: Any) -> Any:
 class SampleOptions(TypedDict, total=False):
     """The options of every transform of samples; see `Augmentation`."""
 
-    camera: Camera | None
+    camera: Camera | float | None
     fields: Mapping[str, str] | None
     mode: str
     padding_mode: str
@@ -198,7 +202,7 @@ class SampleTransform(KeepsCamera, nn.Module):
     def __init__(
         self,
         *,
-        camera: Camera | None = None,
+        camera: Camera | float | None = None,
         fields: Mapping[str, str] | None = None,
         mode: str = "bilinear",
         padding_mode: str = "zeros",
@@ -257,11 +261,15 @@ class SampleTransform(KeepsCamera, nn.Module):
     mirroring: Mirroring | None = None  # what changes places where an augmentation mirrors; None: it never does
     needs_camera: bool = True  # whether samples, or it, need a camera; edits do not
 
-    def _camera_of(self, named: Named) -> Camera:
-        """Return the camera of a sample that has none, nor the augmentation."""
+    makes_pinholes: bool = True  # whether a pinhole camera becomes one, as far as that is known before a draw
+
+    def _camera_of(self, named: Named, guess: Guess | None) -> Camera:
+        """Return the camera of a sample that has none, nor the augmentation: by K, guessed, or unknown."""
         how = f"give one as sample['camera'] or {self._name}(camera=...)"
-        if self.needs_camera:
-            raise ValueError(f"{self._name}: the sample must have a camera; got none. Please {how}. {GUESS_CAMERA}")
+        guessed = f"camera=60, degrees across, takes pinholes for photographs of unknown cameras; {GUESS_CAMERA}"
+        matrix = next(((name, value) for name, (kind, value) in named.items() if kind == "K"), None)
+        if self.needs_camera and guess is None and matrix is None:
+            raise ValueError(f"{self._name}: the sample must have a camera; got none. Please {how}. {guessed}")
         for name, (found, value) in named.items():
             first = value[0] if isinstance(value, list) and value else value
             if found == "image" and isinstance(first, Tensor) and first.shape[-1] <= 4 < first.shape[-3:][0]:
@@ -273,11 +281,24 @@ class SampleTransform(KeepsCamera, nn.Module):
             if found in IMAGES:
                 items = value if isinstance(value, list) else [value]
                 self._check_one_size(name, {(one.shape[-2], one.shape[-1]) for one in items})
-                return Unknown.of((items[0].shape[-2], items[0].shape[-1]))
+                size = items[0].shape[-2], items[0].shape[-1]
+                if matrix is not None:
+                    return matrices.camera_of(*matrix, size, self._name)
+                return Unknown.of(size) if guess is None else guess.camera(size)
         raise ValueError(
             f"{self._name}: the sample must have an image or a camera, as labels move by the image's size; got "
             f"{', '.join(named)}. For a camera, {how}"
         )
+
+    def _check_matrices(self, batch: Batch, sample: Sample) -> Batch:
+        """Return a batch; raise a ValueError if its fields K are not its camera, or cannot be the new one's."""
+        of = "the camera of the sample" if sample.get("camera") is not None else "that of the augmentation"
+        for name, kind in batch.plan.fields.items():
+            if kind == "K":
+                matrices.check_agrees(name, batch.plan.rows(batch.values[name]), batch.camera, of, self._name)
+                if not self.makes_pinholes:
+                    matrices.refuse(name, self._name)
+        return batch
 
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
         """Return the sample and the keyword arguments as one dict."""
@@ -301,10 +322,23 @@ class SampleTransform(KeepsCamera, nn.Module):
         images = [name for name, kind in found.items() if kind == "image" and getattr(given[name], "ndim", 0) == 5]
         if not images:
             return None
-        own = {name for name, kind in found.items() if kind is not None and name != "rotation"}
+        own = {name for name, kind in found.items() if kind not in (None, "K") and name != "rotation"}
+        whole = ["camera", "rotation", PLACE]
+        for name in (name for name, kind in found.items() if kind == "K"):
+            if getattr(given[name], "ndim", 3) == 4:  # of each frame
+                matrices.check_alike(name, given[name], self._name)
+                own.add(name)
+            else:
+                whole.append(name)
         own |= {f"{name}_valid" for name in own} | {"image_valid", *(self.mirroring.by_name if self.mirroring else ())}
         shape = tuple(given[images[0]].shape[:2])
-        return Clips(sample, [name for name in given if name in own], shape, images[0], self._name)
+        return Clips(sample, [name for name in given if name in own], whole, shape, images[0], self._name)
+
+    def _moving(self, sample: Sample, fields: Mapping[str, str]) -> Named:
+        """Return the fields that move, at least one."""
+        if not (named := self._sorted(sample, fields)):
+            raise ValueError(f"{self._name}: the sample must have a field that moves; got none of {', '.join(KINDS)}")
+        return named
 
     def _sorted(self, sample: Sample, fields: Mapping[str, str], single: bool = False) -> Named:
         """Return the fields that move."""
@@ -330,11 +364,15 @@ class SampleTransform(KeepsCamera, nn.Module):
         camera = sample.get("camera") if camera is None else camera
         camera = self.camera if camera is None else camera
         fields = {**self.fields, **kinds} if kinds else self.fields
+        if camera is None or isinstance(camera, Guess):
+            own = self.camera if isinstance(self.camera, Camera) else None  # a front end may have brought the number
+            camera = self._camera_of(self._moving(sample, fields), camera) if own is None else own
         form = self._form_of(sample, camera, fields)
         known = None if form is None else self._calls.plans.entry((), form)
         if known is not None:
-            return Batch(known[2], sample, camera, predicted)
-        batch = self._checked_batch(sample, camera, fields, predicted)
+            batch = Batch(known[2], sample, camera, predicted)
+            return self._check_matrices(batch, sample) if "K" in batch.plan.fields.values() else batch
+        batch = self._check_matrices(self._checked_batch(sample, camera, fields, predicted), sample)
         if form is not None and batch.camera is camera and all(v is sample[n] for n, v in batch.values.items()):
             self._calls.plans((), form, lambda: batch.plan)
         return batch
@@ -360,9 +398,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         return *parts, is_free, self._calls.revision, *fields.items()
 
     def _checked_batch(self, sample: Sample, camera: Any, fields: Mapping[str, str], predicted: bool) -> Batch:
-        if not (named := self._sorted(sample, fields)):
-            raise ValueError(f"{self._name}: the sample must have a field that moves; got none of {', '.join(KINDS)}")
-        camera = self._camera_of(named) if camera is None else camera
+        named = self._moving(sample, fields)
         batched = not isinstance(sample, Single) and is_batch(named, camera)
         if not batched:
             self._sorted(sample, fields, single=True)  # raises for whole numbers of more than a row
@@ -487,6 +523,10 @@ class SampleTransform(KeepsCamera, nn.Module):
         """Return the sample with all that moves by a change, what is valid of it, the rotation and the camera."""
         plan, values, _, checked = batch
         moved, batched = dict(sample), plan.batched
+        if "K" in plan.fields.values():
+            lens = next((part.target for part in change.parts if not isinstance(part.target, Pinhole)), None)
+            for name in (name for name, kind in plan.fields.items() if kind == "K" and lens is not None):
+                matrices.refuse(name, self._name, type(lens).__name__)
         options: dict[str, float] = {"mask_fill": self.mask_fill}
         if self.mirroring is not None:
             options["lateral"] = self.mirroring.lateral

@@ -20,6 +20,7 @@ from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
 from camtorch.augment.fields import IMAGES, KEEP, KINDS, OWN, as_tensor, kind_of, pattern_of
 from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
+from camtorch.augment.matrices import Guess
 from camtorch.augment.place import PLACE
 from camtorch.augment.sample import Frames, Sample, detached, on_samples
 from camtorch.cameras.camera import Camera
@@ -70,7 +71,9 @@ class Transform(FrontEnd, v2.Transform):
 
     Args:
         augmentation: the augmentation to apply.
-        camera: for samples that hold none; default: the augmentation's. It is copied, and does not learn.
+        camera: for samples that hold none; default: the augmentation's. It is copied, and does not learn. A number is
+            for photographs of unknown cameras, see `Augmentation`; a sample that is a dict then gets `camera`, that of
+            the new image, for further transforms of camtorch.
         valid: whether points and boxes in dicts get flags.
 
     Raises:
@@ -79,11 +82,11 @@ class Transform(FrontEnd, v2.Transform):
             image_size; if numbers under an unknown name might be geometry; if a PIL image holds no colours.
     """
 
-    camera: Camera | None
+    camera: Camera | float | None
     valid: bool
     _name = _OWNER
 
-    def __init__(self, augmentation: Augmentation, camera: Camera | None = None, *, valid: bool = False):
+    def __init__(self, augmentation: Augmentation, camera: Camera | float | None = None, *, valid: bool = False):
         super().__init__()
         check_front_end(_OWNER, augmentation)
         self.augmentation, self.camera, self.valid = augmentation, camera, bool(valid)
@@ -114,10 +117,13 @@ class Transform(FrontEnd, v2.Transform):
         cameras = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Camera)]
         if len(cameras) > 1:
             raise ValueError(f"{_OWNER}: a sample must have one camera; got {len(cameras)}")
-        camera = camera_of_sample(_OWNER, self.augmentation, leaves[cameras[0]] if cameras else self.camera, sizes)
+        own = self.augmentation
+        matrix = next(((keys[i], value) for i, (kind, value, _) in fields.items() if kind == "K"), None)
+        camera = camera_of_sample(_OWNER, own, leaves[cameras[0]] if cameras else self.camera, sizes, matrix)
         kinds = {keys[i]: kind or KEEP for i, (kind, _, _) in fields.items()}
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
         sample = Frames({keys[i]: value for i, (_, value, _) in fields.items()}, camera=detached(camera))
+        guessed = matrix is None and isinstance(self.camera or own.camera, Guess) and not isinstance(own.camera, Camera)
 
         def write(moved: Sample, change: Change) -> Any:
             for i, (kind, _, back) in fields.items():
@@ -126,8 +132,10 @@ class Transform(FrontEnd, v2.Transform):
             for i in cameras:
                 leaves[i] = moved["camera"]
             result = pytree.tree_unflatten(leaves, spec)
-            if self.augmentation.place and isinstance(result, dict):
+            if own.place and isinstance(result, dict):
                 result[PLACE] = moved[PLACE]
+            if guessed and not cameras and isinstance(result, dict):
+                result["camera"] = moved["camera"]
             for i in fields if self.valid else ():
                 path, valid = paths[i], moved.get(f"{keys[i]}_valid")
                 if valid is not None and path and isinstance(path[-1], pytree.MappingKey):

@@ -1,0 +1,176 @@
+"""Pinhole cameras of samples without a camera: of a matrix K among their fields, or guessed for images of any size."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NoReturn
+
+import torch
+from torch import Tensor
+
+from camtorch.cameras.camera import Camera
+from camtorch.evaluate.tensors import known_false, values_of
+from camtorch.models import Pinhole
+from camtorch.values.arguments import check_degrees, warn
+from camtorch.values.dtypes import widen
+
+if TYPE_CHECKING:
+    from camtorch.augment.change import Change
+
+NAMES = "K", "intrinsics", "camera_matrix"
+SHAPE = "(B, 3, 3) or (B, 4, 4), [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of the image"
+_ALIKE = 1e-5  # relative: matrices that were float32 on the way are the same ones
+_SCALED = 0.05  # how far apart the scales of x and y may be of a matrix of an image of another size
+_log = logging.getLogger(__name__)
+
+
+class Guess(float):
+    """Degrees across of the pinhole camera that stands in for the unknown one of photographs, of any size."""
+
+    @classmethod
+    def of(cls, degrees: float, owner: str) -> Guess:
+        if not 0 < degrees < 180:
+            raise ValueError(
+                f"{owner}: camera must be a Camera, or degrees across of a guessed pinhole, above 0 and below 180; "
+                f"got {degrees!r}"
+            )
+        check_degrees(degrees, degrees, owner)
+        return cls(degrees)
+
+    def camera(self, size: tuple[int, int]) -> Pinhole:
+        """Return the camera of images of a size (height, width), one for all of them."""
+        known = _guessed.__wrapped__ if torch.compiler.is_compiling() else _guessed
+        return known(float(self), (int(size[0]), int(size[1])))
+
+
+@functools.lru_cache(256)
+def _guessed(degrees: float, size: tuple[int, int]) -> Pinhole:
+    if not torch.compiler.is_compiling():
+        _tell()
+    with torch.inference_mode(False), torch.no_grad():  # it may be used in a graph later
+        return Pinhole.from_fov(degrees, image_size=size).requires_grad_(False)
+
+
+@functools.lru_cache(1)
+def _tell() -> None:
+    """Note, once a process, that cameras are guessed."""
+    _log.info(
+        "cameras are guessed: images without one are taken for those of a pinhole of the degrees given as camera=. "
+        "Positions in images move as they look; directions and poses are as right as the guess"
+    )
+
+
+def hint(name: str, value: Tensor, batched: bool) -> str:
+    """Return what to do about a wrong shape of a matrix K."""
+    if value.shape[-2:] in ((3, 3), (4, 4)) and batched and value.ndim == 2:
+        return f"One that all samples share goes in as {name}.expand(B, -1, -1)"
+    if value.shape[-1:] == (4,):
+        return "Numbers fx, fy, cx, cy go in as camera=ct.Pinhole(numbers, image_size=(height, width))"
+    return f"If it is something else, fields={{{name!r}: 'keep'}} keeps it unchanged"
+
+
+def check(name: str, value: Tensor, owner: str) -> None:
+    """Raise a ValueError if matrices (..., 3, 3) or (..., 4, 4) are not those of pinhole cameras without skew."""
+    given = value.detach()
+    wanted = torch.eye(given.shape[-1], dtype=given.dtype, device=given.device)
+    wanted[:2, :3] = given.new_tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
+    free = torch.zeros_like(wanted, dtype=torch.bool)
+    free[0, 0] = free[1, 1] = free[0, 2] = free[1, 2] = True
+    free[3:, 3:] = True
+    wrong = ~(torch.where(free, torch.isfinite(given), given == wanted).flatten(-2).all(-1))
+    wrong = wrong | (given[..., 0, 0] <= 0) | (given[..., 1, 1] <= 0)
+    if known_false(~wrong):
+        one = given.reshape(-1, *given.shape[-2:])[wrong.reshape(-1)][0].tolist()
+        raise ValueError(
+            f"{owner}: {name} must be {SHAPE}, with fx, fy above 0 and no skew; got {one}. Leave one unchanged with "
+            f"fields={{{name!r}: 'keep'}}, and give the camera of the images as camera="
+        )
+
+
+def numbers_of(matrix: Tensor) -> Tensor:
+    """Return fx, fy, cx, cy (..., 4) of matrices."""
+    wide = widen(matrix)
+    return torch.stack((wide[..., 0, 0], wide[..., 1, 1], wide[..., 0, 2], wide[..., 1, 2]), -1)
+
+
+def camera_of(name: str, matrix: Tensor | list[Tensor], size: tuple[int, int], owner: str) -> Pinhole:
+    """Return the camera of images of a size (height, width) with a matrix, a batch or a list; gradients reach it."""
+    rows = matrix if isinstance(matrix, list) else [matrix]
+    for row in rows:
+        if row.shape[-2:] not in ((3, 3), (4, 4)) or row.ndim > 3 - isinstance(matrix, list):
+            raise ValueError(f"{owner}: {name} must be {SHAPE}; got shape {tuple(row.shape)}. {hint(name, row, False)}")
+        check(name, row, owner)
+    numbers = torch.stack([numbers_of(row) for row in rows]) if isinstance(matrix, list) else numbers_of(matrix)
+    _warn_of_size(name, numbers, size, owner)
+    camera = Pinhole(numbers, image_size=size)
+    return camera if numbers.requires_grad else camera.requires_grad_(False)
+
+
+def _warn_of_size(name: str, numbers: Tensor, size: tuple[int, int], owner: str) -> None:
+    """Warn if a matrix seems to be that of an image of another size, or of sides of 1."""
+    known = values_of(numbers.detach()) if numbers.is_cpu else None
+    if known is None or not known.numel():
+        return
+    fx, _, cx, cy = known.reshape(-1, 4)[0].tolist()
+    height, width = size
+    across, down = (2 * cx + 1) / width, (2 * cy + 1) / height
+    if 0 <= cx <= 1 and 0 <= cy <= 1 and fx < 10 and min(size) > 8:
+        warn(
+            f"{owner}: {name} must be in pixels of the image; got parts of its sides. Multiply the first row by the "
+            "width, the second by the height, and subtract 0.5 from cx and cy"
+        )
+    elif abs(across - down) < _SCALED * across and not 0.8 < across < 1.25:
+        seems = round(height * down), round(width * across)
+        warn(
+            f"{owner}: {name} must be of the image, of (height, width) = {tuple(size)}; got cx, cy = {cx:.6g}, "
+            f"{cy:.6g}, the middle of {seems}. Scale cx by (cx + 0.5) * width / old width - 0.5, fx by width / old "
+            "width, and so y. Of a part that was cut out all is well"
+        )
+
+
+def check_agrees(name: str, matrix: Tensor | list[Tensor], camera: Camera, of: str, owner: str) -> None:
+    """Raise a ValueError if matrices are not those of the `camera` beside them.
+
+    of: whose camera it is, in words.
+    """
+    agrees = isinstance(camera, Pinhole)
+    if agrees and len(matrix):
+        ours = numbers_of(matrix) if isinstance(matrix, Tensor) else torch.stack([numbers_of(row) for row in matrix])
+        near = max(_ALIKE, 2 * torch.finfo(matrix[0].dtype).eps)
+        theirs = camera.intrinsics.detach().to(ours)
+        agrees = not known_false(torch.isclose(ours.detach(), theirs, near, _ALIKE))
+    if not agrees:
+        kind = "cameras of several models" if camera.is_mixed else f"a {type(camera).__name__} of other numbers"
+        raise ValueError(
+            f"{owner}: {name} must be the camera of the image, and agree with another one; got {of}, {kind}. Leave one "
+            f"of both out, or keep the matrix unchanged with fields={{{name!r}: 'keep'}}"
+        )
+
+
+def check_alike(name: str, matrix: Tensor, owner: str) -> None:
+    """Raise a ValueError if matrices (B, T, 3, 3) differ between the frames of a clip, which share a camera."""
+    if known_false(matrix == matrix[:, :1]):
+        raise ValueError(
+            f"{owner}: {name} must be the same in all frames of a clip, (B, 3, 3) or (B, T, 3, 3); got others. Frames "
+            "of several cameras go in as a batch: all fields by .flatten(0, 1)"
+        )
+
+
+def refuse(name: str, owner: str, kind: str = "lens of another kind") -> NoReturn:
+    """Raise the ValueError of a new camera that has no matrix K."""
+    raise ValueError(
+        f"{owner}: {name} must be the camera of the new image, and only pinhole cameras have one; got a {kind}. Give "
+        f"camera=ct.Pinhole.from_matrix({name}, image_size=(height, width)) instead, and take 'camera' of the result, "
+        f"or keep the matrix unchanged with fields={{{name!r}: 'keep'}}"
+    )
+
+
+def moved(change: Change, matrix: Tensor, options: Mapping[str, float]) -> Tensor:
+    """Return the matrices (B, 3, 3) or (B, 4, 4) of the cameras after a change; the other entries stay."""
+    result = widen(matrix).clone()
+    new = change.target.intrinsics.to(result)
+    for i, (row, column) in enumerate(((0, 0), (1, 1), (0, 2), (1, 2))):
+        result[..., row, column] = new[..., i]
+    return result
