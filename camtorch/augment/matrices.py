@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.tensors import known_false, values_of
+from camtorch.cameras.numbers import off_centre, warn_of_order, warn_of_size
+from camtorch.evaluate.tensors import known_false
 from camtorch.models import Pinhole
-from camtorch.values.arguments import check_degrees, warn
+from camtorch.values.arguments import check_degrees
 from camtorch.values.dtypes import widen
+from camtorch.warp.views import pinhole
 
 if TYPE_CHECKING:
     from camtorch.augment.change import Change
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 NAMES = "K", "intrinsics", "camera_matrix"
 SHAPE = "(B, 3, 3) or (B, 4, 4), [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of the image"
 _ALIKE = 1e-5  # relative: matrices that were float32 on the way are the same ones
-_SCALED = 0.05  # how far apart the scales of x and y may be of a matrix of an image of another size
+_told: set[str] = set()  # who warned of a matrix of another image in this process
 _log = logging.getLogger(__name__)
 
 
@@ -103,31 +105,11 @@ def camera_of(name: str, matrix: Tensor | list[Tensor], size: tuple[int, int], o
             raise ValueError(f"{owner}: {name} must be {SHAPE}; got shape {tuple(row.shape)}. {hint(name, row, False)}")
         check(name, row, owner)
     numbers = torch.stack([numbers_of(row) for row in rows]) if isinstance(matrix, list) else numbers_of(matrix)
-    _warn_of_size(name, numbers, size, owner)
-    camera = Pinhole(numbers, image_size=size)
-    return camera if numbers.requires_grad else camera.requires_grad_(False)
-
-
-def _warn_of_size(name: str, numbers: Tensor, size: tuple[int, int], owner: str) -> None:
-    """Warn if a matrix seems to be that of an image of another size, or of sides of 1."""
-    known = values_of(numbers.detach()) if numbers.is_cpu else None
-    if known is None or not known.numel():
-        return
-    fx, _, cx, cy = known.reshape(-1, 4)[0].tolist()
-    height, width = size
-    across, down = (2 * cx + 1) / width, (2 * cy + 1) / height
-    if 0 <= cx <= 1 and 0 <= cy <= 1 and fx < 10 and min(size) > 8:
-        warn(
-            f"{owner}: {name} must be in pixels of the image; got parts of its sides. Multiply the first row by the "
-            "width, the second by the height, and subtract 0.5 from cx and cy"
-        )
-    elif abs(across - down) < _SCALED * across and not 0.8 < across < 1.25:
-        seems = round(height * down), round(width * across)
-        warn(
-            f"{owner}: {name} must be of the image, of (height, width) = {tuple(size)}; got cx, cy = {cx:.6g}, "
-            f"{cy:.6g}, the middle of {seems}. Scale cx by (cx + 0.5) * width / old width - 0.5, fx by width / old "
-            "width, and so y. Of a part that was cut out all is well"
-        )
+    if owner not in _told and (off := off_centre(numbers, size)):
+        _told.add(owner)
+        warn_of_order(off, size, owner)
+        warn_of_size(off, size, owner)
+    return pinhole(numbers, size)
 
 
 def check_agrees(name: str, matrix: Tensor | list[Tensor], camera: Camera, of: str, owner: str) -> None:

@@ -1,0 +1,273 @@
+"""Laws of samples without a camera: a matrix K among their fields, and degrees of a guessed camera."""
+
+import copy
+import logging
+import pickle
+import re
+
+import numpy as np
+import pytest
+import torch
+
+import camtorch as ct
+import camtorch.augment.numpy
+from camtorch.augment import matrices
+
+A, SIZE = ct.augment, (96, 128)
+K = torch.tensor([[120.0, 0, 61], [0, 124, 46], [0, 0, 1]])
+POINTS = torch.rand(2, 9, 3, generator=torch.Generator().manual_seed(1)) - torch.tensor([0.5, 0.5, -1.5])
+BOXES = torch.tensor([[[40.0, 30, 80, 70]]]).expand(2, -1, -1)
+AUGMENTATIONS = {
+    "mount": lambda **o: A.RandomMount(zoom=0.2, **o),
+    "of half the rows": lambda **o: A.RandomMount(p=0.5, **o),
+    "pinhole lens": lambda **o: A.RandomLens(fov=(40, 60), **o),
+    "camera": lambda **o: A.RandomCamera("pinhole", fov=50, image_size=(60, 70), **o),
+    "mirror": lambda **o: A.HorizontalFlip(p=1.0, **o),
+    "upside down": lambda **o: A.VerticalFlip(**o),
+    "quarter turn": lambda **o: A.Rotate90(same_on_batch=True, **o),
+    "size": lambda **o: A.Resize((50, 80), **o),
+    "part": lambda **o: A.RandomResizedCrop((40, 50), **o),
+    "rim": lambda **o: A.Pad((1, 2, 3, 4), **o),
+    "box": lambda **o: A.BoxCrop((64, 48), yaw=3, **o),
+    "chain": lambda **o: A.Compose([A.RandomMount(), A.RandomCrop((80, 90)), A.HorizontalFlip()], **o),
+    "box after a lens": lambda **o: A.Compose([A.RandomLens("dms130", fov=70, min_filled=0), A.BoxCrop((64, 48))], **o),
+}
+
+
+def projected(matrix, points):
+    pixels = points.to(matrix) @ matrix[..., :3, :3].mT
+    return pixels[..., :2] / pixels[..., 2:]
+
+
+def sample(matrix, name="K", *, single=False):
+    fields = {"image": torch.rand(2, 3, *SIZE), "points": POINTS, "boxes": BOXES, name: matrix}
+    fields["keypoints"] = projected(matrix, POINTS)
+    return {key: value[0] for key, value in fields.items()} if single else fields
+
+
+def matrix_of(dims, dtype=torch.float32):
+    """Two matrices, of which a larger one has a last row and column of its own."""
+    matrix = torch.eye(dims).repeat(2, 1, 1).to(dtype)
+    matrix[:, :3, :3] = K
+    matrix[1, 0, 0] += 7
+    return matrix
+
+
+def of_matrix(matrix, size=SIZE):
+    return ct.Pinhole.from_matrix(matrix[..., :3, :3], image_size=size).requires_grad_(False)
+
+
+def check_labels(out, name="K"):
+    off = (projected(out[name], out["points"]) - out["keypoints"])[out["keypoints_valid"]]
+    assert off.abs().max() < 0.01
+
+
+@pytest.mark.parametrize("dims", [3, 4])
+@pytest.mark.parametrize("field", ["K", "intrinsics", "camera_matrix", "of_cam"])
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+def test_new_matrices_project_points_on_their_pixels(name, field, dims):
+    augment = AUGMENTATIONS[name](fields={"of_cam": "K"})
+    for dtype in (torch.float32, torch.float64):
+        matrix = matrix_of(dims, dtype)
+        for single in (False, True):
+            given = sample(matrix, field, single=single)
+            for _ in range(2):  # as first and as later samples
+                out = augment(given)
+                check_labels(out, field)
+                assert (out[field].shape, out[field].dtype) == (given[field].shape, dtype)
+                new = out[field][..., (0, 1, 0, 1), (0, 1, 2, 2)]
+                torch.testing.assert_close(out["camera"].intrinsics, new, rtol=0, atol=0)
+                assert (out[field] == 0).sum() == (given[field] == 0).sum()
+            torch.testing.assert_close(given[field], matrix[0] if single else matrix, rtol=0, atol=0)
+            if name not in ("part", "of half the rows"):
+                torch.testing.assert_close(augment.inverse(out)[field], given[field])
+
+
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+def test_a_matrix_moves_as_its_camera(name):
+    augment, fields = AUGMENTATIONS[name](), sample(matrix_of(3))
+    draw = augment.draw(2)
+    by_matrix = augment(fields, draw=draw)
+    by_camera = augment({n: v for n, v in fields.items() if n != "K"}, camera=of_matrix(fields["K"]), draw=draw)
+    assert by_matrix.keys() == by_camera.keys() | {"K"}
+    for key in by_camera.keys() - {"camera"}:
+        assert torch.equal(by_matrix[key], by_camera[key])
+
+
+def test_lists_clips_frames_and_half_precision():
+    matrix = matrix_of(3)
+    fields = sample(matrix)
+    out = A.RandomMount()({name: list(value) for name, value in fields.items()})
+    for i in range(2):
+        check_labels({name: value[i] for name, value in out.items() if name != "camera"})
+    for given in (matrix, matrix[:, None].expand(-1, 4, -1, -1)):
+        frames = {n: v[:, None].expand(-1, 4, *v.shape[1:]) for n, v in fields.items() if n not in ("K", "boxes")}
+        out = A.RandomMount()(frames, K=given)
+        assert out["K"].shape == given.shape
+        each = out["K"] if out["K"].ndim == 4 else out["K"][:, None]
+        check_labels({**out, "K": each})
+    differ = torch.stack([matrix, 2 * matrix_of(3) - K, matrix, matrix], 1)
+    with pytest.raises(ValueError, match="K must be the same in all frames of a clip"):
+        A.RandomMount()(frames, K=differ)
+    half = A.HorizontalFlip(p=1.0)(image=fields["image"], K=matrix.half())["K"]
+    assert half.dtype == torch.float16
+    assert half[0, 0, 2] == SIZE[1] - 1 - 61
+
+
+def test_gradients_reach_a_matrix():
+    matrix = matrix_of(3, torch.float64).requires_grad_()
+    torch.manual_seed(0)
+    augment = A.RandomMount(yaw=5)
+    draw, pixels = augment.draw(2), projected(matrix_of(3, torch.float64), POINTS)
+
+    def moved(given):
+        out = augment(image=torch.zeros(2, 1, *SIZE), K=given, keypoints=pixels, draw=draw)
+        return out["keypoints"].sum() + out["K"].sum()
+
+    moved(matrix).backward()
+    step = torch.zeros_like(matrix)
+    step[0, 0, 0] = 1e-4
+    with torch.no_grad():
+        numeric = (moved(matrix + step) - moved(matrix - step)) / 2e-4
+    torch.testing.assert_close(matrix.grad[0, 0, 0], numeric, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:.*will show nothing")
+def test_who_wins():
+    fields = sample(matrix_of(3))
+    same, other = of_matrix(fields["K"]), ct.Pinhole.from_fov(60, image_size=SIZE)
+    assert torch.equal(A.Resize(SIZE, camera=60)(fields)["camera"].intrinsics, same.intrinsics)  # K, else the number
+    check_labels(A.RandomMount()(fields, camera=same))
+    chain = torch.nn.Sequential(A.RandomMount(), A.HorizontalFlip(), A.RandomMount(camera=60))
+    check_labels(chain(fields))  # the second finds a camera beside K, which agrees
+    fisheye = ct.KannalaBrandt.from_fov(60, image_size=SIZE)
+    for wrong in (other, fisheye, [fisheye, other]):
+        for message, call in (
+            ("camera of the sample", lambda wrong=wrong: A.RandomMount()(fields, camera=wrong)),
+            ("that of the augmentation", lambda wrong=wrong: A.RandomMount(camera=wrong)(fields)),
+        ):
+            if isinstance(wrong, list) and "augmentation" in message:
+                continue
+            for _ in range(2):
+                with pytest.raises(ValueError, match=rf"K must be the camera.*{message}.*fields=\{{'K': 'keep'\}}"):
+                    call()
+    with pytest.raises(ValueError, match="intrinsics must be the camera"):
+        A.RandomMount()(fields, intrinsics=matrix_of(3) * torch.tensor([2.0, 2, 1])[:, None])
+    used = A.RandomMount(camera=same[0])
+    once = {n: v[0] for n, v in fields.items()}
+    used(once)
+    with pytest.raises(ValueError, match="K must be the camera"):  # of a form that is known
+        used(once, K=matrix_of(3)[1])
+    kept = A.RandomMount(camera=other, fields={"K": "keep"})(fields)
+    assert torch.equal(kept["K"], fields["K"])
+
+
+class Lens(A.Augmentation):
+    def new_camera(self, source, values):
+        return ct.KannalaBrandt(source.intrinsics, torch.zeros(4), image_size=source.image_size), None
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: A.RandomLens("dms130", fov=50),
+        lambda: A.RandomLens("real", p=1e-9),
+        lambda: A.RandomCamera("kannala_brandt", fov=50),
+        lambda: A.Compose([A.BoxCrop((64, 48)), A.RandomLens("dms130", fov=40), A.HorizontalFlip()], p=1e-9),
+        Lens,
+    ],
+)
+def test_lenses_are_refused(make):
+    one = {name: value[0] for name, value in sample(matrix_of(3)).items()}
+    with pytest.raises(ValueError, match=r"K must be.*only pinhole.*camera=ct\.Pinhole\.from_matrix\(K.*'keep'"):
+        make()(one)
+    with pytest.raises(ValueError, match="only pinhole cameras have one"):
+        camtorch.augment.numpy.Transform(make())(
+            image=np.zeros((*SIZE, 3), np.uint8), K=K.numpy(), boxes=BOXES[0].numpy()
+        )
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (K, r"K must be \(B, 3, 3\).*got shape \(3, 3\).*K\.expand\(B, -1, -1\)"),
+        (torch.tensor([[120.0, 124, 61, 46]] * 2), r"\(2, 4\).*camera=ct\.Pinhole\(numbers"),
+        (matrix_of(3)[..., :2, :], r"\(2, 2, 3\)"),
+        (matrix_of(3).mT, "fx, fy above 0 and no skew"),
+        (-matrix_of(3), "fx, fy above 0"),
+        (matrix_of(3) * torch.nan, "above 0"),
+        (matrix_of(4) + 1, "no skew"),
+        (matrix_of(3)[:1], "K must be of 2 samples"),
+    ],
+)
+def test_what_is_no_matrix_is_refused(value, message):
+    with pytest.raises(ValueError, match=message):
+        A.RandomMount()(image=torch.rand(2, 3, *SIZE), K=value)
+    with pytest.raises(ValueError, match="must have an image"):
+        A.RandomMount()(K=K, points=POINTS[0])
+
+
+@pytest.mark.parametrize(("scale", "message"), [(2, "about .height, width. = .192, 256"), (1 / 128, "parts of the")])
+def test_a_matrix_of_another_image_warns_once(scale, message, monkeypatch):
+    monkeypatch.setattr(matrices, "_told", set())
+    matrix = K * torch.tensor([scale, scale, 1.0])[:, None]
+    with pytest.warns(UserWarning, match=f"Resize: .*{message}"):
+        A.Resize(20)(image=torch.rand(3, *SIZE), K=matrix)
+    A.Resize(20)(image=torch.rand(3, *SIZE), K=matrix)
+
+
+def test_other_things_of_such_names_pass():
+    for value in (5, "camera.yml", torch.tensor(3), torch.tensor([1, 2]), ["a", "b"]):
+        out = A.RandomMount(camera=60)(image=torch.rand(2, 3, *SIZE), K=value, intrinsics=value)
+        assert out["K"] is value
+    for name in ("K_inv", "K_left", "cam_K"):  # an inverse, or a camera beside
+        with pytest.raises(ValueError, match=f"'{name}' must have a kind"):
+            A.RandomMount(camera=60)(image=torch.rand(3, *SIZE), **{name: K})
+
+
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+def test_a_number_is_a_pinhole_for_images_of_any_size(name):
+    augment = AUGMENTATIONS[name](camera=60)
+    augment = pickle.loads(pickle.dumps(copy.deepcopy(augment)))
+    for size in (SIZE, (128, 96), SIZE):
+        camera = ct.Pinhole.from_fov(60, image_size=size).requires_grad_(False)
+        fields = {"image": torch.rand(2, 3, *size), "keypoints": torch.rand(2, 5, 2) * 90, "boxes": BOXES}
+        draw = augment.draw(2)
+        out, want = augment(fields, draw=draw), augment(fields, camera=camera, draw=draw)
+        assert out["camera"].image_size == want["camera"].image_size
+        assert torch.equal(out["camera"].intrinsics, want["camera"].intrinsics)
+        for key in ("image", "keypoints", "rotation"):
+            assert torch.equal(out[key], want[key])
+        again = A.HorizontalFlip(p=1.0, camera=90)(out)  # which goes on with the camera of the result
+        assert torch.equal(again["camera"].fov[:, 1], out["camera"].fov[:, 1])
+        listed = augment({n: list(value) for n, value in fields.items()}, draw=draw)
+        assert torch.equal(listed["image"][1], out["image"][1])
+
+
+def test_a_guess_is_told_once(caplog):
+    matrices._tell.cache_clear()
+    matrices._guessed.cache_clear()
+    with caplog.at_level(logging.INFO, logger="camtorch"):
+        for size in (SIZE, (50, 60)):
+            A.RandomMount(camera=60)(image=torch.rand(3, *size))
+    assert [re.match("cameras are guessed", record.message) is not None for record in caplog.records] == [True]
+
+
+@pytest.mark.parametrize("value", [0, 180, -60, 1.0, float("nan"), True, "60"])
+def test_bad_numbers_are_refused(value):
+    error = ValueError if type(value) in (int, float) else TypeError
+    for make in (A.RandomMount, A.Resize, lambda **o: A.Compose([A.RandomMount()], **o)):
+        given = (SIZE,) if make is A.Resize else ()
+        with pytest.raises(error, match="must be"):
+            make(*given, camera=value)
+    with pytest.raises(error, match=r"numpy\.Transform: (camera|fov) must be"):
+        camtorch.augment.numpy.Transform(A.RandomMount(), value)
+
+
+def test_a_number_needs_an_image():
+    augment = A.RandomMount(camera=60)
+    for call in (lambda: augment(gaze=torch.rand(3)), lambda: augment.change(None, augment.draw(1))):
+        with pytest.raises(ValueError, match=r"must have an image|camera must be given; got 60"):
+            call()
+    with pytest.raises(ValueError, match="channels first"):
+        augment(image=torch.rand(*SIZE, 3))
