@@ -426,3 +426,27 @@ def test_a_kornia_that_lacks_a_part_is_refused_by_its_name(owner, name, monkeypa
         monkeypatch.delattr(owner, name)
     with pytest.raises(ImportError, match=rf"got 0.*\b{name}\b.*pip install 'kornia==0.9"):
         runpy.run_path(kornia_parts.__file__)
+
+
+def test_labels_follow_a_lens_in_the_container_in_which_theirs_stay_behind():
+    """kornia#4420: its fisheye and its elastic map move images, and no keypoints and boxes."""
+    spot = torch.zeros(1, 1, *SIZE)
+    spot[..., 24:31, 36:43] = 1  # a blob about (39, 27)
+    point, box = torch.tensor([[[39.0, 27.0]]]), torch.tensor([[[36.0, 24, 42, 30]]])
+    grid = torch.stack(torch.meshgrid(torch.arange(WIDTH), torch.arange(HEIGHT), indexing="xy"), -1)
+    narrow = torch.tensor([-0.01, 0.01])
+    ours = adapter.RandomLens("kannala_brandt", fov=80, centre=None, focal=None, camera=60, min_filled=0)
+    theirs = K.RandomFisheye(narrow, narrow, torch.tensor([0.9, 1.0]), p=1.0), K.RandomElasticTransform(p=1.0)
+    for aug in (*theirs, ours):
+        torch.manual_seed(1)
+        pipeline = K.AugmentationSequential(aug, data_keys=["input", "keypoints", "bbox_xyxy"])
+        image, moved, boxes = pipeline(spot, point, box)
+        centroid = (image[0, 0, :, :, None] * grid).sum((0, 1)) / image.sum()
+        assert (centroid - point[0, 0]).norm() > 0.3
+        if aug is ours:
+            torch.testing.assert_close(moved[0, 0], centroid, rtol=0, atol=0.1)
+            assert (boxes - box).abs().max() > 1
+            assert (boxes[0, 0].unflatten(0, (2, 2)).mean(0) - centroid).norm() < 0.5
+        else:
+            assert torch.equal(moved, point)
+            assert torch.equal(boxes, box)

@@ -59,7 +59,7 @@ def of_matrix(matrix, size=SIZE):
 
 def check_labels(out, name="K"):
     off = (projected(out[name], out["points"]) - out["keypoints"])[out["keypoints_valid"]]
-    assert off.abs().max() < 0.01
+    assert off.numel() == 0 or off.abs().max() < 0.01
 
 
 @pytest.mark.parametrize("dims", [3, 4])
@@ -207,7 +207,7 @@ def test_what_is_no_matrix_is_refused(value, message):
         A.RandomMount()(K=K, points=POINTS[0])
 
 
-@pytest.mark.parametrize(("scale", "message"), [(2, "about .height, width. = .192, 256"), (1 / 128, "parts of the")])
+@pytest.mark.parametrize(("scale", "message"), [(2, "seem to be of images of about .height, width. = .192"), (1 / 128, "parts of the")])
 def test_a_matrix_of_another_image_warns_once(scale, message, monkeypatch):
     monkeypatch.setattr(matrices, "_told", set())
     matrix = K * torch.tensor([scale, scale, 1.0])[:, None]
