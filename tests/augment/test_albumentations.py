@@ -88,3 +88,25 @@ def test_what_is_wrong_is_told():
         A.Compose([ct.augment.albumentations.Transform(ct.augment.RandomMount())])(image=sample()["image"])
     with pytest.raises(ValueError, match=r"image must be of the camera's image_size \(48, 64\); got \(47, 64\)"):
         A.Compose([transform()])(image=sample()["image"][1:])
+
+
+def test_trainers_move_boxes_by_the_name_of_a_class():
+    """As Ultralytics and RF-DETR make a pipeline: with boxes if the name of a transform is among those they know."""
+
+    class OpticalDistortion(ct.augment.albumentations.Transform):
+        """Of docs/guides/pipelines.md."""
+
+    lens = ct.augment.RandomLens("kannala_brandt", fov=80, min_filled=0)
+    one = OpticalDistortion(**{"augmentation": lens, "camera": 60, "p": 1.0})
+    pipeline = A.Compose([one, A.Blur(p=0.1)], bbox_params=A.BboxParams(format="yolo", label_fields=["class_labels"]))
+    pipeline.set_random_seed(0)
+    for height, width in ((48, 64), (80, 50)):
+        image, box = np.zeros((height, width, 3), np.uint8), np.array([[0.5, 0.5, 0.4, 0.5]])
+        out = pipeline(image=image, bboxes=box, class_labels=np.array([[3.0]]))
+        boxes = torch.tensor([[0.3 * width, 0.25 * height, 0.7 * width, 0.75 * height]]) - 0.5
+        moved = lens.moved_by(one.augmentation.last, {"boxes": boxes})["boxes"][0].numpy() + 0.5
+        assert out["image"].shape == image.shape
+        assert out["camera"].image_size == (height, width)
+        middle, sides = (moved[:2] + moved[2:]) / 2, moved[2:] - moved[:2]
+        np.testing.assert_allclose(out["bboxes"][0], np.concatenate((middle, sides)) / ([width, height] * 2), atol=1e-3)
+        assert np.abs(out["bboxes"][0] - box[0]).max() > 0.01
