@@ -134,6 +134,7 @@ CASES |= {
     "views.cube": tried(lambda c, i: (v := views.cube(c, 8)) and (v.valid_masks(), v.back(v(i))), FISHEYE, IMAGES),
     "views.ring": tried(lambda c, i: views.ring(c, 3, size=8)(i), FISHEYE, IMAGES),
     "views.look_at": tried(lambda c, b, i: views.look_at(c, b, (8, 8))(i), FISHEYE, BOXES, IMAGES[:1]),
+    "views.crop_place": tried(lambda c, b: views.crop_place(views.look_at(c, b[None], (8, 8))), FISHEYE, BOXES),
     "rectify": tried(lambda c, e, i: ct.rectify(c, c, e).left(i), BROWN, POSE, IMAGES),
     "triangulate": tried(ct.triangulate, FISHEYE, PAIR, SEEN),
     "solve_pnp": tried(lambda c, e, p: ct.solve_pnp(c, p, c.project(e(p))[0]), FISHEYE, POSE, POINTS[0]),
