@@ -38,7 +38,7 @@ PHOTOGRAPHS = Path(__file__).with_name("photographs")
 LENSES = {
     "GoPro HERO11, 121 degrees": "GoPro HERO11 Black Wide 2464x2156",
     "Insta360 Go, 150 degrees": "Insta360 Go fisheye automatic",
-    "RunCam ThumbPro, 176 degrees": "RunCam ThumbPro Foxeer 1.8 XView",
+    "RunCam ThumbPro, 173 degrees": "RunCam ThumbPro Foxeer 1.7mm 2704x1520",
 }
 """Name -> words for `ct.lenses.find`."""
 WINDOWS = (15, 30)  # degrees across a photograph: a face about 110 and 55 cm away
