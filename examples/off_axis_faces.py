@@ -4,9 +4,9 @@
     python examples/off_axis_faces.py --detector dlib --model shape_predictor_68_face_landmarks.dat -o dlib.png
 
 The 20 faces of examples/photographs are brought to places up to 60 degrees from the axis of three real lenses, at two
-distances. `stress_test.py` does the same with a network of yours, and explains how. Besides its columns this measures
-head poses that `ct.solve_pnp` finds by the camera from the landmarks of both crops, and what the detector finds in the
-whole image, to the right of its middle.
+distances; this takes about ten minutes. `stress_test.py` does the same with a network of yours, and explains how.
+Besides its columns this measures head poses that `ct.solve_pnp` finds by the camera from the landmarks of both crops,
+and what the detector finds in the whole image, to the right of its middle.
 
 MediaPipe: `pip install mediapipe`, and
 https://storage.googleapis.com/mediapipe-models/face_landmarker/face_landmarker/float16/1/face_landmarker.task
@@ -40,7 +40,7 @@ LENSES = {
     "Insta360 Go, 150 degrees": "Insta360 Go fisheye automatic",
     "RunCam ThumbPro, 173 degrees": "RunCam ThumbPro Foxeer 1.7mm 2704x1520",
 }
-"""Name -> words for `ct.lenses.find`."""
+"""Name -> words for `ct.lenses.find`; of square pixels, or plain crops are squeezed on the axis too."""
 WINDOWS = (15, 30)  # degrees across a photograph: a face about 110 and 55 cm away
 BOX = (55.75, 44.5, 231.25, 241.5)  # of the face, in the 288 pixels of a photograph
 WAYS = {**stress_test.WAYS, "whole": "whole image"}
@@ -201,7 +201,6 @@ def main(detector: str, out: str, model: str | None = None, numbers: str | None 
     predict, start = made(detector, model), time.perf_counter()
     results = study(predict, DETECTORS[detector])
     print("\n".join([*stress_test.table(results["all"], WAYS), *at_angle(results)]))
-    print("\n".join(stress_test.sentences(results["all"])))
     print(f"{time.perf_counter() - start:.0f} s")
     draw(results["all"], f"{detector}, medians over {', '.join(LENSES)}", out)
     if numbers:
