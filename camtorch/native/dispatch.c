@@ -24,6 +24,7 @@
 /* What it is, its name, and what it is given */
 #define EACH_ENTRY(ENTRY)                                                                                              \
     ENTRY(int32_t, sample, Job *)                                                                                      \
+    ENTRY(void, sample_images, const Images *)                                                                         \
     ENTRY(int32_t, classify, const Classification *)                                                                   \
     ENTRY(int64_t, geometry, const Rows *)                                                                             \
     ENTRY(int64_t, moves, const Move *)                                                                                \
@@ -178,7 +179,8 @@ EXPORTED int64_t camtorch_together(const Together *given) {
         for (int c = 0; c < 2; c++)
             narrowed((double *)lattices->exact + c * SQUARES * lattices->cells.rows * lattices->cells.columns,
                      SQUARES * *lattices->used);
-    for (int64_t i = 0; i < given->job_count && given->is_whole; i++) given->jobs[i].next = 0, camtorch_sample(given->jobs + i);
+    const Images images = {given->jobs, given->is_whole ? given->job_count : 0, 0};
+    camtorch_sample_images(&images);
     for (int64_t i = 0; i < given->move_count; i++) left |= camtorch_moves(given->moves + i);
     for (const Turned *one = given->turned; one < given->turned + given->turned_count; one++) {
         left |= one->form == POSE && !is_rotation(one) ? LEFT_LABELS : 0;

@@ -54,7 +54,7 @@ enum { FEW, SOME, RATIO, ROOTS, ANGLES, ALL, ANY };
     }
 
 int32_t THIS(classify)(const Classification *);
-void THIS(sample_image)(const Job *, int64_t);
+void THIS(sample_images)(const Images *);
 
 /* How many numbers a part has: the `parameters` of its chart or stage */
 static int numbers_of(const Part *part) {

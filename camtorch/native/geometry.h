@@ -185,7 +185,7 @@ typedef struct {
 
 /* One sample: a lattice of one camera, images that are sampled on it, in parts or whole, pixels that move, and vectors */
 typedef struct {
-    Job *jobs;
+    const Job *jobs;
     int64_t job_count, is_whole; /* 0: others sample the images */
     const Move *moves;
     int64_t move_count;

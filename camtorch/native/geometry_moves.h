@@ -346,7 +346,8 @@ static int64_t T(lattices)(const Lattices *given) {
     b.index = -1;
     while ((at = taken(given->move.next, &own)) < given->move.cameras && !left) {
         left = T(lattice)(given, at, &b);
-        for (int64_t i = 0; i < given->job_count && !left; i++) THIS(sample_image)(given->jobs + i, at);
+        const Images images = {given->jobs, left ? 0 : given->job_count, at};
+        THIS(sample_images)(&images);
     }
     return left;
 }

@@ -1,9 +1,10 @@
 /* Samples images where a warp says, in tiles of rows: one variant, for the instructions that it is compiled for.
  *
- * A tile goes by columns of chunks, a chunk row by row. Positions come from a grid or from a lattice, between whose
- * nodes lie cubics. Pixels are made eight at a time in floats (`eight`), with AVX2 bytes in fixed point
- * (`fixed_point`), and with AVX-512 up to 32 at a time (`wide`). What they cannot make goes one by one through
- * `sample_at`, and so does everything in the variant without vectors, with which tests compare the others.
+ * A tile goes by columns of chunks, STEP rows of which are made for one image after the other. Positions come from a
+ * grid or from a lattice, between whose nodes lie cubics. Pixels are made eight at a time in floats (`eight`), with
+ * AVX2 bytes in fixed point (`fixed_point`), and with AVX-512 up to 32 at a time (`wide`). What they cannot make goes
+ * one by one through `sample_at`, and so does everything in the variant without vectors, with which tests compare the
+ * others.
  */
 #include "sampler.h"
 
@@ -1474,7 +1475,7 @@ INLINE int64_t wide(Span *span, char *first, const Chunk *at, int64_t i, int64_t
 #if VECTORS
 
 /* Brings positions of n pixels along one axis onto the image, as the padding reads it; NaN stays */
-NOT_INLINE void pad(float *x, int64_t n, int64_t side, int padding, int type) {
+NOT_INLINE void pad(const float *x, float *to, int64_t n, int64_t side, int padding, int type) {
     /* the last pixel belongs to the square before it, as bytes are interpolated */
     const float end = (float)(side - 1), last = type == UINT8 ? end - greater(end, 128) * 1.2e-7f : end;
     const V8 far = every8(2097152.0f);
@@ -1488,21 +1489,24 @@ NOT_INLINE void pad(float *x, int64_t n, int64_t side, int padding, int type) {
                 for (k = 0; k < STEP; k++) at[k] = at[k] == at[k] ? reflected(at[k], (float)side) : at[k];
         }
         at = clamped8(at, greater(last, 0));
-        memcpy(x + i, &at, sizeof at);
+        memcpy(to + i, &at, sizeof at);
     }
+    to[i] = to[i - 1];
 }
 
 #endif
 
-INLINE void chunk(Span *span, char *first, Chunk *at, int64_t n, int type, int mode, int layout) {
+INLINE void chunk(Span *span, char *first, const Chunk *at, int64_t n, int type, int mode, int layout) {
     int64_t i = 0;
 #if VECTORS
     const Job *job = span->job;
+    Chunk on_image;
     const int64_t step = job->result_strides[3] * size_of(type);
     int64_t end = (n + STEP - 1) / STEP * STEP;
     if (job->padding != ZEROS && taps_along(mode) <= 2) {
-        pad(at->u, n, job->source_width, job->padding, type);
-        pad(at->v, n, job->source_height, job->padding, type);
+        pad(at->u, on_image.u, n, job->source_width, job->padding, type);
+        pad(at->v, on_image.v, n, job->source_height, job->padding, type);
+        at = &on_image;
     }
     while (i < n && shows_nothing(job, load8(at->u + i), load8(at->v + i), mode)) i += STEP;
     while (end > i && shows_nothing(job, load8(at->u + end - STEP), load8(at->v + end - STEP), mode)) end -= STEP;
@@ -1532,22 +1536,39 @@ INLINE void chunk(Span *span, char *first, Chunk *at, int64_t n, int type, int m
 
 /* -- tiles */
 
-INLINE void tile(const Job *job, int64_t b, int64_t from, int64_t to, int type, int mode, int layout) {
+/* Makes n pixels of each of some rows */
+INLINE void rows(const Job *job, const Chunk *at, int64_t b, int64_t y, int64_t count, int64_t x, int64_t n, int type,
+                 int mode, int layout) {
     const int64_t *strides = job->result_strides;
     Span span;
-    Lines lines;
-    Chunk at;
-    int64_t x, y;
+    int64_t i;
     span.job = job;
     span.source = (const char *)job->source + b * job->source_strides[0] * size_of(type);
-    for (x = 0; x < job->width; x += CHUNK) {
-        const int64_t n = job->width - x < CHUNK ? job->width - x : CHUNK, filled = (n + STEP - 1) / STEP * STEP;
-        for (y = from; y < to; y++) {
-            if (job->nodes) lattice_positions(job, b, y, x, n, from, &lines, &at);
-            else grid_positions(job, b, y, x, n, &at);
-            at.u[filled] = at.u[filled - 1], at.v[filled] = at.v[filled - 1];
-            chunk(&span, (char *)job->result + (b * strides[0] + y * strides[2] + x * strides[3]) * size_of(type), &at, n,
-                  type, mode, layout);
+    for (i = 0; i < count; i++)
+        chunk(&span, (char *)job->result + (b * strides[0] + (y + i) * strides[2] + x * strides[3]) * size_of(type), at + i, n,
+              type, mode, layout);
+}
+
+typedef void (*Rows)(const Job *, const Chunk *, int64_t, int64_t, int64_t, int64_t, int64_t);
+
+enum { MOST_TOGETHER = 8 }; /* images whose positions are made once */
+
+/* Of `many` jobs of one size and the same positions */
+static void tile(const Job *jobs, const Rows *make, int many, int64_t b, int64_t from, int64_t to) {
+    Lines lines;
+    Chunk at[STEP];
+    int64_t x, y, i;
+    int k;
+    for (x = 0; x < jobs->width; x += CHUNK) {
+        const int64_t n = jobs->width - x < CHUNK ? jobs->width - x : CHUNK, filled = (n + STEP - 1) / STEP * STEP;
+        for (y = from; y < to; y += STEP) {
+            const int64_t count = to - y < STEP ? to - y : STEP;
+            for (i = 0; i < count; i++) {
+                if (jobs->nodes) lattice_positions(jobs, b, y + i, x, n, from, &lines, at + i);
+                else grid_positions(jobs, b, y + i, x, n, at + i);
+                at[i].u[filled] = at[i].u[filled - 1], at[i].v[filled] = at[i].v[filled - 1];
+            }
+            for (k = 0; k < many; k++) make[k](jobs + k, at, b, y, count, x, n);
         }
     }
 }
@@ -1561,12 +1582,11 @@ static int layout_of(const Job *job) {
     return SCATTERED;
 }
 
-typedef void (*Tile)(const Job *, int64_t, int64_t, int64_t);
-
-#define NAME(type, mode, layout) JOINED(JOINED(JOINED(tile, type), mode), layout)
+#define NAME(type, mode, layout) JOINED(JOINED(JOINED(rows, type), mode), layout)
 #define MADE(type, mode, layout)                                                                                       \
-    NOT_INLINE void NAME(type, mode, layout)(const Job *job, int64_t b, int64_t from, int64_t to) {                    \
-        tile(job, b, from, to, type, mode, layout);                                                                    \
+    NOT_INLINE void NAME(type, mode, layout)(const Job *job, const Chunk *at, int64_t b, int64_t y, int64_t count,     \
+                                             int64_t x, int64_t n) {                                                   \
+        rows(job, at, b, y, count, x, n, type, mode, layout);                                                          \
     }
 #define COMPUTED(type, mode, taps, reach, weights)                                                                     \
     MADE(type, mode, PLANES)                                                                                           \
@@ -1583,27 +1603,39 @@ MADE(BYTES8, NEAREST, SCATTERED)
 
 #define BY_LAYOUT(type, mode, taps, reach, weights)                                                                    \
     {NAME(type, mode, PLANES), NAME(type, mode, INTERLEAVED), NAME(type, mode, SCATTERED)},
-static const Tile computed[][COMPUTING_MODES][3] = {
+static const Rows computed[][COMPUTING_MODES][3] = {
     {COMPUTING(BY_LAYOUT, UINT8)},
     {COMPUTING(BY_LAYOUT, BOOL)},
     {COMPUTING(BY_LAYOUT, UINT16)},
     {COMPUTING(BY_LAYOUT, FLOAT32)},
 };
-static const Tile moved[] = {NAME(BYTES1, NEAREST, SCATTERED), NAME(BYTES2, NEAREST, SCATTERED),
+static const Rows moved[] = {NAME(BYTES1, NEAREST, SCATTERED), NAME(BYTES2, NEAREST, SCATTERED),
                              NAME(BYTES4, NEAREST, SCATTERED), NAME(BYTES8, NEAREST, SCATTERED)};
 
-static Tile way_of(const Job *job) {
+static Rows way_of(const Job *job) {
     if (job->mode == NEAREST) return moved[job->type - BYTES1];
     return computed[job->type][job->mode - BILINEAR][layout_of(job)];
 }
 
-/* One image as a whole */
-void THIS(sample_image)(const Job *job, int64_t b) { way_of(job)(job, b, 0, job->height); }
+/* Whole images on this thread, of each row one after the other */
+void THIS(sample_images)(const Images *given) {
+    Rows make[MOST_TOGETHER];
+    int64_t i, from;
+    int k, many;
+    for (i = 0; i < given->count; i += many) {
+        const Job *jobs = given->jobs + i;
+        const int64_t step = jobs->tile_rows, height = jobs->height;
+        many = given->count - i < MOST_TOGETHER ? (int)(given->count - i) : MOST_TOGETHER;
+        for (k = 0; k < many; k++) make[k] = way_of(jobs + k);
+        for (from = 0; from < height; from += step)
+            tile(jobs, make, many, given->image, from, from + step < height ? from + step : height);
+    }
+}
 
 /* Makes tiles until none is left that nobody has taken; how many it made */
 int32_t THIS(sample)(Job *job) {
     const int64_t tiles = (job->height + job->tile_rows - 1) / job->tile_rows;
-    const Tile make = way_of(job);
+    const Rows make = way_of(job);
     int32_t made;
     for (made = 0;; made++) {
         const int64_t i = __atomic_fetch_add(&job->next, 1, __ATOMIC_RELAXED);
@@ -1612,7 +1644,7 @@ int32_t THIS(sample)(Job *job) {
         /* one image after the other of the same rows: positions that they share are in the cache then */
         b = i % job->count;
         from = i / job->count * job->tile_rows;
-        make(job, b, from, from + job->tile_rows < job->height ? from + job->tile_rows : job->height);
+        tile(job, &make, 1, b, from, from + job->tile_rows < job->height ? from + job->tile_rows : job->height);
     }
 }
 

@@ -47,6 +47,12 @@ typedef struct {
     int64_t next; /* the tile that whoever is free takes */
 } Job;
 
+/* Images of one size, of which each shows the same positions of a lattice */
+typedef struct {
+    const Job *jobs;
+    int64_t count, image; /* how many; which one of each job */
+} Images;
+
 typedef struct {
     /* positions as of grid_sample of nodes (b, component, rows + 5, columns + 5), whether they are mapped (b, same), */
     const float *nodes;

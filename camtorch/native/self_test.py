@@ -53,6 +53,10 @@ def _answers(library: Library) -> Iterator[tuple[str, Iterable[float], Iterable[
     library.camtorch_sample(job)
     yield "camtorch_sample", results, (0.5, 2.5)
 
+    images, results[:] = structs.Images(jobs=at(job), count=1), [0, 0]
+    library.camtorch_sample_images(images)
+    yield "camtorch_sample_images", results, (0.5, 2.5)
+
     nodes, scratch, cells = (c_float * 144)(), (c_float * (9 * structs.SCRATCH))(), c_int32()
     asked = structs.Classification(nodes=at(nodes), count=1, rows=1, columns=1, height=8, width=8, tolerance=0.1)
     asked.node_strides[:], asked.mapped, asked.rim, asked.cells = (72, 36), at(valid), at(valid), at(cells)

@@ -7,7 +7,7 @@ from ctypes import POINTER, c_char_p, c_double, c_int32, c_int64, c_uint32, c_vo
 
 from camtorch.native.structure import Calls, Numbers, Struct
 
-CHECKSUM = 1454573680
+CHECKSUM = 3370701357
 
 UINT8 = 0
 BOOL = 1
@@ -216,6 +216,20 @@ class Job(Struct):
     padding: int
     tile_rows: int
     next: int
+
+
+class Images(Struct):
+    """`Images` of the headers."""
+
+    __slots__ = ()
+    _fields_ = (
+        ("jobs", c_void_p),
+        ("count", c_int64),
+        ("image", c_int64),
+    )
+    jobs: int | None
+    count: int
+    image: int
 
 
 class Classification(Struct):
@@ -744,7 +758,7 @@ class Steps(Struct):
     left: int | None
 
 
-STRUCTS = Agreement, Job, Classification, Part, Cameras, Domain, Rows, Move, Lattices, Turned, Together, Draws, Poses, Views, Steps
+STRUCTS = Agreement, Job, Images, Classification, Part, Cameras, Domain, Rows, Move, Lattices, Turned, Together, Draws, Poses, Views, Steps
 
 
 class Library(Calls):
@@ -752,6 +766,7 @@ class Library(Calls):
 
     types = {
         "camtorch_sample": (c_int32, [POINTER(Job)]),
+        "camtorch_sample_images": (None, [POINTER(Images)]),
         "camtorch_classify": (c_int32, [POINTER(Classification)]),
         "camtorch_geometry": (c_int64, [POINTER(Rows)]),
         "camtorch_moves": (c_int64, [POINTER(Move)]),
@@ -770,6 +785,7 @@ class Library(Calls):
         "camtorch_together": (c_int64, [POINTER(Together)]),
     }
     camtorch_sample: Callable[[Job], int]
+    camtorch_sample_images: Callable[[Images], None]
     camtorch_classify: Callable[[Classification], int]
     camtorch_geometry: Callable[[Rows], int]
     camtorch_moves: Callable[[Move], int]

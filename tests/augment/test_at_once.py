@@ -202,6 +202,7 @@ def odd_samples():
         "turned in memory": {"image": image.mT.contiguous().mT, "keypoints": pixels.T.contiguous().T},
         "expanded": {"image": image[:1].expand(3, -1, -1), "keypoints": pixels[1:2].expand(5, -1)},
         "masks": {"image": image[:1], "mask": image[:1] > 99, "mask_b": image[:2].int(), "mask_c": image[0].double()},
+        "many images": {f"image_{i}": (image + i).float() if i % 2 else image + i for i in range(10)},
         "a batch of one": {"image": image[None], "mask": image[None, 0], "keypoints": pixels[None]},
         "vectors": {
             "image": image,

@@ -52,7 +52,9 @@ static int32_t factor_of(Part *part, int first, int last) {
 
 static int64_t sampled; /* how many images lattices were handed on for */
 
-void sample_image_fuzzed(const Job *job, int64_t b) { sampled += b >= 0 && b < job->count; }
+void sample_images_fuzzed(const Images *given) {
+    for (int64_t i = 0; i < given->count; i++) sampled += given->image >= 0 && given->image < given->jobs[i].count;
+}
 
 /* In the place of the one that kernel.c has, which has a fuzz of its own: cells of any kind */
 int32_t classify_fuzzed(const Classification *given) {
