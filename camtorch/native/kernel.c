@@ -1557,12 +1557,13 @@ enum { MOST_TOGETHER = 8 }; /* images whose positions are made once */
 static void tile(const Job *jobs, const Rows *make, int many, int64_t b, int64_t from, int64_t to) {
     Lines lines;
     Chunk at[STEP];
+    const int64_t step = many > 1 ? STEP : 1; /* rows between two jobs */
     int64_t x, y, i;
     int k;
     for (x = 0; x < jobs->width; x += CHUNK) {
         const int64_t n = jobs->width - x < CHUNK ? jobs->width - x : CHUNK, filled = (n + STEP - 1) / STEP * STEP;
-        for (y = from; y < to; y += STEP) {
-            const int64_t count = to - y < STEP ? to - y : STEP;
+        for (y = from; y < to; y += step) {
+            const int64_t count = to - y < step ? to - y : step;
             for (i = 0; i < count; i++) {
                 if (jobs->nodes) lattice_positions(jobs, b, y + i, x, n, from, &lines, at + i);
                 else grid_positions(jobs, b, y + i, x, n, at + i);
