@@ -33,7 +33,6 @@ SCRIPTS = {
     "stereo": "stereo_room",
     "surround": "surround_view",
     "camera": "predict_camera",
-    "drivers": "driver_monitoring",
     "robots": "robot_cameras",
     "fisheye-depth": "fisheye_depth",
 }
