@@ -120,7 +120,7 @@ def made(name: str, model: str | None) -> Predict:
     detector = DETECTORS[name]
     path = model or detector.model
     if not Path(path).is_file():
-        raise SystemExit(f"off_axis_faces: --model must be a {detector.model}; got {path!r}. --help says where it is")
+        raise SystemExit(f"off_axis_faces: --model must be an existing {detector.model}; got {path!r}. See --help")
     try:
         return detector.make(path)
     except ImportError as error:

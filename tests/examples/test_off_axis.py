@@ -159,7 +159,7 @@ def test_faces_of_a_landmarker_that_always_finds_the_same(landmarker, tmp_path, 
 
 
 def test_what_a_detector_lacks_is_said(tmp_path, monkeypatch):
-    with pytest.raises(SystemExit, match=r"--model must be a face_landmarker\.task; got 'no\.task'"):
+    with pytest.raises(SystemExit, match=r"--model must be an existing face_landmarker\.task; got 'no\.task'"):
         off_axis_faces.made("mediapipe", "no.task")
     (tmp_path / "model.dat").touch()
     monkeypatch.setitem(sys.modules, "dlib", None)
