@@ -67,6 +67,7 @@ FINE: dict[str, Any] = {"mode": "bicubic", "tolerance": 1e-3}  # options of warp
 LARGEST = 768  # pixels, of a photograph
 ANGLES = (0, 15, 30, 45, 60)  # degrees from the axis
 AZIMUTHS = (0, 90, 180, 270)  # degrees in the image, from right to down
+WIDE = 10  # times what the network itself repeats: errors up to there have an axis from 0
 NUDGE, REPEATED = 0.04, -1  # shift of a box as a part of its width, and the angle that stands for it
 WAYS = {"plain": "plain crop", "ray": "with the ray", "look_at": "look_at"}
 FOUND = "found"
@@ -371,7 +372,12 @@ def plot(axis: Any, results: Results, kind: str) -> None:
             axis.plot(angles, values, "o-", color=colour, label=label)
     own = max(LEAST, median(results, kind, REPEATED, "look_at"))
     axis.axhline(own, color="#64748b", linestyle=":", label="repeated")
-    axis.set(xlabel="degrees from the axis", ylabel=f"{kind}, {unit(kind)}", yscale="log")
+    axis.set(xlabel="degrees from the axis", ylabel=f"{kind}, {unit(kind)}")
+    if axis.get_ylim()[1] > WIDE * own:
+        axis.set_yscale("log")
+        axis.yaxis.set_major_formatter("{x:g}")
+    else:
+        axis.set_ylim(0)
     axis.grid(alpha=0.3)
     axis.legend()
 
