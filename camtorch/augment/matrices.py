@@ -149,6 +149,13 @@ def refuse(name: str, owner: str, kind: str = "lens of another kind") -> NoRetur
     )
 
 
+def check_targets(fields: Mapping[str, str], change: Change, owner: str) -> None:
+    """Raise a ValueError if samples with a field K come to a lens without one."""
+    lens = next((part.target for part in change.parts if not isinstance(part.target, Pinhole)), None)
+    if lens is not None:
+        refuse(next(name for name, kind in fields.items() if kind == "K"), owner, type(lens).__name__)
+
+
 def moved(change: Change, matrix: Tensor, options: Mapping[str, float]) -> Tensor:
     """Return the matrices (B, 3, 3) or (B, 4, 4) of the cameras after a change; the other entries stay."""
     result = widen(matrix).clone()

@@ -524,9 +524,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         plan, values, _, checked = batch
         moved, batched = dict(sample), plan.batched
         if "K" in plan.fields.values():
-            lens = next((part.target for part in change.parts if not isinstance(part.target, Pinhole)), None)
-            for name in (name for name, kind in plan.fields.items() if kind == "K" and lens is not None):
-                matrices.refuse(name, self._name, type(lens).__name__)
+            matrices.check_targets(plan.fields, change, self._name)
         options: dict[str, float] = {"mask_fill": self.mask_fill}
         if self.mirroring is not None:
             options["lateral"] = self.mirroring.lateral
@@ -550,20 +548,7 @@ class SampleTransform(KeepsCamera, nn.Module):
                 flags = sample.get(f"{name}_valid")
                 moved[f"{name}_valid"] = valid if flags is None else self._still(f"{name}_valid", valid, flags)
         for key in plan.masks:
-            seen: Any = sample.get(key)
-            if masked := getattr(seen, "ndim", 0) > 1 + batched:  # and no flag for each sample
-                seen = torch.as_tensor(seen) != 0
-                seen = seen if batched else seen[None]
-                if len(seen) != change.count:
-                    raise ValueError(
-                        f"{self._name}: {key} must be of {change.count} samples, as other fields; got {len(seen)}"
-                    )
-                seen, _ = self._one(change, "mask", seen, {"mask_fill": 0.0})
-            if key == "image_valid" and self.valid_mask and "image" in plan.fields.values():
-                whole = change.valid_mask()
-                seen = whole if not masked else seen & (whole if seen.ndim == 4 else whole[:, 0])
-                masked = True
-            if masked:
+            if (seen := self._seen(key, sample.get(key), plan, change)) is not None:
                 moved[key] = seen.contiguous() if batched else seen[0].contiguous()
         if "rotation" not in plan.fields:
             moved["rotation"] = change.rotation.clone() if batched else change.single_rotation
@@ -574,6 +559,21 @@ class SampleTransform(KeepsCamera, nn.Module):
             target = change.several if batched else change.single
             moved["camera"] = list(target) if isinstance(sample.get("camera"), (list, tuple)) else target
         return moved
+
+    def _seen(self, key: str, given: Any, plan: Plan, change: Change) -> Tensor | None:
+        """Return a mask of validity with a dim B, from the one that was given; None if neither is wanted."""
+        seen = None
+        if getattr(given, "ndim", 0) > 1 + plan.batched:  # and no flag for each sample
+            seen = plan.rows(torch.as_tensor(given) != 0)
+            if len(seen) != change.count:
+                raise ValueError(
+                    f"{self._name}: {key} must be of {change.count} samples, as other fields; got {len(seen)}"
+                )
+            seen, _ = self._one(change, "mask", seen, {"mask_fill": 0.0})
+        if key != "image_valid" or not self.valid_mask or "image" not in plan.fields.values():
+            return seen
+        whole = change.valid_mask()
+        return whole if seen is None else seen & (whole if seen.ndim == 4 else whole[:, 0])
 
     def _mirror(self, moved: Sample, named: Named, mirrored: Tensor | None, batched: bool) -> None:
         """Let landmarks and fields of a moved sample change places where they are seen in a mirror."""
