@@ -75,7 +75,7 @@ class BoxCrop(Augmentation):
                 "image.repeat_interleave(F, 0) and boxes.flatten(0, 1)[:, None]; ct.views.look_at takes boxes (B, F, 4)"
             )
         self.crops = {"box": as_whole(index, "index", name)}
-        self.place = as_flag(place, "place", name)
+        self.place: bool = as_flag(place, "place", name)
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """Return the camera that looks at `values["box"]`, (*B, 4), and its rotation; see `Augmentation.new_camera`."""
