@@ -198,7 +198,8 @@ class CameraDrawer(Augmentation):
         if type(self).new_camera is not CameraDrawer.new_camera:
             return super()._new_camera(source, values)
         like = precise(source.intrinsics.detach())
-        return self.new_camera(source, {name: torch.as_tensor(value).to(like) for name, value in values.items()})
+        kind: dict[str, Any] = {"dtype": like.dtype, "device": like.device}  # at once: floats would be float32 first
+        return self.new_camera(source, {name: torch.as_tensor(value, **kind) for name, value in values.items()})
 
     def _drawn(self, source: Camera, values: Mapping[str, Any], share: float | None = None) -> Drawn | None:
         """Return what compiled code makes of a draw; None where something is recorded, or it does not know a model."""

@@ -6,7 +6,7 @@ import difflib
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,7 @@ class Field:
     last: tuple[int, ...]  # what its last dim may be; empty: anything
     shape: str  # in words, of a batch
     move: Move  # (change, batch, options) -> batch, or (batch, valid)
+    _: KW_ONLY
     decides: bool = False  # whether its number of dims distinguishes a batch from a sample
     hint: Callable[[str, Tensor, bool], str] = _no_hint  # (name, value, batched) -> what to do about a wrong shape
     check: Callable[[str, Tensor, str], None] | None = (
@@ -142,7 +143,7 @@ def _sided_boxes(kind: str, form: str) -> Field:
             )
 
     read = functools.partial(as_corners, kind)
-    return Field(2, 2, (4,), f"(B, M, 4) pixels {form}", move, True, _boxes_hint, check_sides)
+    return Field(2, 2, (4,), f"(B, M, 4) pixels {form}", move, decides=True, hint=_boxes_hint, check=check_sides)
 
 
 def _image_hint(name: str, value: Tensor, batched: bool) -> str:
@@ -234,58 +235,96 @@ def _check_pitch_yaw(name: str, value: Tensor, owner: str) -> None:
         )
 
 
+def _images(change: Change, images: Tensor, options: Mapping[str, float]) -> Tensor:
+    return change.images(images)
+
+
 def _rays(change: Change, rays: Tensor, options: Mapping[str, float]) -> Tensor:
     return change.rays(rays)
 
 
 _DIRECTIONS = Field(1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", _rays, hint=_rays_hint, way="rays")
 _POSE = Field(
-    *(2, 2, (4,), "(B, 4, 4) or (B, 3, 4), camera from head", _pose, True),
+    2,
+    2,
+    (4,),
+    "(B, 4, 4) or (B, 3, 4), camera from head",
+    _pose,
+    decides=True,
     hint=_pose_hint,
     check=_check_pose,
     way="pose",
 )
 _MASKS = "(B, C, H, W) or (B, H, W)"
 _DEPTHS = "(B, 1, H, W) or (B, H, W), along"
-_PITCH_YAW = "(B, *N, 2) pitch and yaw of a gaze in radians"
+_LANDMARKS = "(B, N, 2) pixels or (B, N, 3) points of the camera frame"
 KINDS = {
-    "image": Field(3, 3, (), "(B, C, H, W)", lambda change, images, _: change.images(images), True, _image_hint),
+    "image": Field(3, 3, (), "(B, C, H, W)", _images, decides=True, hint=_image_hint),
     "mask": Field(2, 3, (), _MASKS, _planes(lambda change, masks, given: change.labels(masks, given["mask_fill"]))),
     "depth": Field(2, 3, (), f"{_DEPTHS} z", _planes(lambda change, depth, _: change.depth(depth))),
     "distance": Field(2, 3, (), f"{_DEPTHS} the ray", _planes(lambda change, distance, _: change.distance(distance))),
     "keypoints": Field(
-        2, 3, (2,), "(B, N, 2) or (B, F, N, 2) pixels x, y", _pixels, True, _keypoints_hint, way="pixels"
+        2,
+        3,
+        (2,),
+        "(B, N, 2) or (B, F, N, 2) pixels x, y",
+        _pixels,
+        decides=True,
+        hint=_keypoints_hint,
+        way="pixels",
     ),
-    "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, True, way="pixels"),
+    "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, decides=True, way="pixels"),
     "boxes": Field(
-        *(2, 2, (4,), "(B, M, 4) pixels x1, y1, x2, y2", lambda change, boxes, _: change.boxes(boxes), True),
-        *(_boxes_hint, _check_corners, "boxes"),
+        2,
+        2,
+        (4,),
+        "(B, M, 4) pixels x1, y1, x2, y2",
+        lambda change, boxes, _: change.boxes(boxes),
+        decides=True,
+        hint=_boxes_hint,
+        check=_check_corners,
+        way="boxes",
     ),
     "boxes_xywh": _sided_boxes("boxes_xywh", "x, y, width, height"),
     "boxes_cxcywh": _sided_boxes("boxes_cxcywh", "x and y of the centre, width, height"),
-    "landmarks": Field(
-        *(2, 3, (2, 3), "(B, N, 2) pixels or (B, N, 3) points of the camera frame", _pixels, True, _landmarks_hint)
-    ),
+    "landmarks": Field(2, 3, (2, 3), _LANDMARKS, _pixels, decides=True, hint=_landmarks_hint),
     "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _positions, hint=_column_hint, way="rays"),
     "gaze": _DIRECTIONS,
     "directions": _DIRECTIONS,
     "pitch_yaw": Field(
-        *(1, _MANY, (2,), _PITCH_YAW, lambda change, angles, _: change.rays(angles, from_pitch_yaw, to_pitch_yaw)),
+        1,
+        _MANY,
+        (2,),
+        "(B, *N, 2) pitch and yaw of a gaze in radians",
+        lambda change, angles, _: change.rays(angles, from_pitch_yaw, to_pitch_yaw),
         check=_check_pitch_yaw,
     ),
     "head_pose": _POSE,
     "pose": _POSE,
     "rvec": Field(
-        *(1, 1, (3,), "(B, 3), a rotation vector, camera from head", _rotation_vector, True, _column_hint, _check_rvec),
+        1,
+        1,
+        (3,),
+        "(B, 3), a rotation vector, camera from head",
+        _rotation_vector,
+        decides=True,
+        hint=_column_hint,
+        check=_check_rvec,
         way="rotation vectors",
     ),
-    "tvec": Field(1, 1, (3,), "(B, 3), a point of the camera frame", _positions, True, _column_hint, way="rays"),
+    "tvec": Field(
+        1, 1, (3,), "(B, 3), a point of the camera frame", _positions, decides=True, hint=_column_hint, way="rays"
+    ),
     "rotation": Field(
-        *(2, 2, (3,), "(B, 3, 3), turned so far", lambda change, turn, _: change.rays(turn, _columns, _columns)),
+        2,
+        2,
+        (3,),
+        "(B, 3, 3), turned so far",
+        lambda change, turn, _: change.rays(turn, _columns, _columns),
         hint=_column_hint,
         way="columns",
     ),
-    "K": Field(2, 2, (3, 4), matrices.SHAPE, matrices.moved, True, matrices.hint, matrices.check),
+    "K": Field(2, 2, (3, 4), matrices.SHAPE, matrices.moved, decides=True, hint=matrices.hint, check=matrices.check),
 }
 BOXES = "boxes", *_PLACED
 ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}

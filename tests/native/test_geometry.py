@@ -24,6 +24,14 @@ pytestmark = pytest.mark.skipif(not native_available(), reason="the library is n
 each_kind = pytest.mark.parametrize("key", slow_unless(KEYS.__contains__, [*KEYS, *(f"{k} others" for k in KEYS)]))
 each_dtype = pytest.mark.parametrize("dtype", slow_unless([torch.float64].__contains__, [torch.float64, torch.float32]))
 
+# models that compiled code must know
+CODED = {
+    "brown_conrady", "cylindrical", "division", "double_sphere", "equirectangular", "equisolid", "eucm",
+    "f_theta", "f_theta_backward", "f_theta_backward_sheared", "f_theta_sheared", "fisheye62", "fisheye624",
+    "fov", "kannala_brandt", "latlon", "mei", "ocamcalib", "orthographic_fisheye", "pinhole", "splined",
+    "stereographic", "tabulated", "thin_prism_fisheye", "transverse_cylindrical", "ucm", "woodscape",
+}  # fmt: skip
+
 # no rays, none that a chart may cover, and some that are
 WILD = [[0, 0, 0], [math.nan, 0, 1], [1, math.nan, 1], [math.inf, 0, 1], [0, -math.inf, math.nan], [0, 0, -1]]
 WILD += [[1e-30, 0, 1e-30], [1e30, 2e30, 3e30], [1e-12, 1e-12, 1], [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, -1, -1e-9]]
@@ -34,6 +42,8 @@ def native(camera):
     intrinsics = camera.intrinsics.detach().reshape(-1, 4)
     distortion = camera.distortion.detach().reshape(len(intrinsics), -1)
     found = CameraRows(type(camera), intrinsics, distortion).native
+    if found is None and type(camera).key not in CODED:
+        pytest.skip("its parts have no codes of C, which are optional")
     assert found is not None
     return found
 

@@ -8,6 +8,7 @@ from cameras import RANGES, STATED
 from rigs import MANIFEST, load
 
 import camtorch as ct
+from camtorch.augment.fields import KINDS
 from camtorch.cameras import operators
 from camtorch.maps import formats as maps
 from camtorch.values.stub import listed_names
@@ -74,6 +75,18 @@ def test_every_class_is_in_the_laws(base, file):
     names = {kind.__name__ for kind in classes(getattr(ct.augment, base))} - {"Edit", "CameraDrawer"}
     assert len(names) > 5
     assert sorted(name for name in names if not re.search(rf"A\.{name}\b", text)) == [], f"{file} lacks them"
+
+
+def test_every_kind_of_field_is_on_its_page():
+    page = (ROOT / "docs" / "guides" / "augment.md").read_text()
+    table = page[page.index("## Fields of a sample") : page.index("### Which camera")]
+    assert [kind for kind in KINDS if f"`{kind}`" not in table] == []
+
+
+def test_every_augmentation_is_one_of_kornia():
+    kornia = pytest.importorskip("camtorch.augment.kornia")
+    names = {kind.__name__ for kind in classes(ct.augment.Augmentation)} - {"Edit", "CameraDrawer", "RandomShutter"}
+    assert sorted(name for name in names if not hasattr(kornia, name)) == []
 
 
 def test_operators_keep_the_names_that_saved_programs_have():
