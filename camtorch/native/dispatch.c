@@ -150,6 +150,21 @@ static void turned_rotations(const Turned *given) {
     }
 }
 
+/* Whether no rotation is more than two turns, as those in degrees are; `check_radians` */
+static int are_radians(const Turned *given) {
+    const double most = 157.91367041742974 * (1 + 1e-6); /* (4 pi)^2 */
+    int all = 1;
+    for (int64_t i = 0, at = 0; i < given->count; i++, at += given->strides[0]) {
+        double square = 0;
+        for (int k = 0; k < 3; k++) {
+            const double one = number(given->rows, at + k * given->strides[1], given->is_double);
+            square += one * one;
+        }
+        all &= !(square > most); /* or what is not a number */
+    }
+    return all;
+}
+
 /* Whether the first three vectors are the columns of a rotation, as far as they are taken for one */
 static int is_rotation(const Turned *given) {
     double m[3][3], off = 0;
@@ -184,6 +199,7 @@ EXPORTED int64_t camtorch_together(const Together *given) {
     for (int64_t i = 0; i < given->move_count; i++) left |= camtorch_moves(given->moves + i);
     for (const Turned *one = given->turned; one < given->turned + given->turned_count; one++) {
         left |= one->form == POSE && !is_rotation(one) ? LEFT_LABELS : 0;
+        left |= one->form == ROTATION_VECTORS && !are_radians(one) ? LEFT_LABELS : 0;
         if (one->turn && one->form == ROTATION_VECTORS) turned_rotations(one);
         else if (one->turn) (one->is_double ? turned_double : turned_float)(one);
     }

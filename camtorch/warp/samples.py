@@ -205,7 +205,7 @@ class SampleCall:
             call.lattices.jobs, call.lattices.job_count = call.jobs, call.job_count
         else:
             self._back.next = None  # one thread makes the lattice, and needs no counter of those made
-        self._doubtful = [i for i, how in enumerate(form.hows) if how in ("boxes", "pose")]
+        self._doubtful = [i for i, how in enumerate(form.hows) if how in ("boxes", "pose", "rotation vectors")]
         self._dtype, self._count = dtype, count
         self.keeps_dtypes: bool = all(
             isinstance(how, Sampler) or value.dtype == dtype for value, how in zip(form.values, form.hows, strict=True)
@@ -221,8 +221,8 @@ class SampleCall:
     ) -> list[tuple[Tensor, Tensor | None] | None] | None:
         """Move `values` of the form from one camera to another; also return which pixels and boxes are valid.
 
-        None if the call does not serve. Those of boxes and poses alone are None if some take more than their outline,
-        or are none.
+        None if the call does not serve. Those of boxes, poses and rotation vectors alone are None if some take more
+        than their outline, or are none.
         """
         dtype = self._dtype
         if rotation is not None and (rotation.dtype != dtype or not rotation.is_contiguous()):

@@ -165,6 +165,17 @@ def test_rotation_vectors_that_are_none_stay_none_and_those_that_do_not_turn_sta
                 torch.testing.assert_close(1 / out, 1 / vector, rtol=0, atol=0, equal_nan=True)
 
 
+def test_rotation_vectors_in_degrees_are_refused_after_others():
+    for dtype in DTYPES:
+        camera = example("pinhole", SIZE).to(dtype).requires_grad_(False)
+        for augment in (A.RandomMount(camera=camera), A.RandomMount(yaw=0, pitch=0, roll=0, camera=camera)):
+            augment(rvec=torch.tensor([0.1, 0.2, 0.3], dtype=dtype))
+            for _ in range(2):
+                with pytest.raises(ValueError, match=r"rvec must be .* in radians; got an angle of 37"):
+                    augment(rvec=torch.tensor([30.0, 20, 10], dtype=dtype))
+            augment(rvec=torch.tensor([0.0, 4 * math.pi, 0], dtype=dtype))
+
+
 @pytest.mark.parametrize("name", LAST)
 def test_boxes_of_a_sample_move_as_by_its_warp(name):
     camera, first = example("brown_conrady", SIZE).requires_grad_(False), torch.tensor([20.0, 20, 60, 50])
