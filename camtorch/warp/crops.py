@@ -97,7 +97,7 @@ class CropsWarp(Warp):
         where = rows.by_pixel()
         parts = [None if part is None else part.unflatten(0, batch).flatten(1, 2) for part in where]
         made = render(rows.lengthened(images), Sampling(*parts), *sampler)  # type: ignore[arg-type]
-        return torch.unflatten(made, 2, (batch[1], -1)).movedim(2, 1).contiguous()  # type: ignore[return-value]
+        return torch.unflatten(made, 2, (batch[1], self.target.height)).movedim(2, 1).contiguous()  # type: ignore[return-value]
 
     def strips(self, *args: Any, **options: Any) -> Iterator[Any]:
         """Raise: `warp.by_rows`, a warp for images (B * F, C, H, W), has strips."""

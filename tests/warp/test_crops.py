@@ -90,6 +90,16 @@ def test_several_crops_of_each_image(count):
     assert warp.detach()(images.detach().movedim(1, -1).numpy()).shape == (2, 3, *SIZE, 1)
 
 
+def test_no_crops_of_some_images():
+    warp = ct.views.look_at(fisheye(), boxes().new_zeros(2, 0, 4), SIZE)
+    for images in (smooth_images(2), smooth_images(1), smooth_images(2)[:, None].expand(-1, 0, -1, -1, -1)):
+        assert warp(images).shape == (2, 0, 1, *SIZE)
+    assert warp.inverse()(warp(smooth_images(2))).shape == (2, 0, 1, 120, 160)
+    assert warp.valid_mask().shape == (2, 0, 1, *SIZE)
+    assert warp.transform_points(boxes().new_zeros(2, 0, 5, 2))[0].shape == (2, 0, 5, 2)
+    assert ct.views.crop_place(warp).shape == (2, 0, 5)
+
+
 def test_shapes_that_could_be_misread_are_refused():
     many = torch.stack((boxes(), boxes() + 7, boxes()), 1)
     warp = ct.views.look_at(fisheye(), many, SIZE)
