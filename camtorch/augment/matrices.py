@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
+from camtorch.cameras.mixed import Mixed
 from camtorch.cameras.numbers import off_centre, warn_of_order, warn_of_size
 from camtorch.evaluate.tensors import known_false
 from camtorch.models import Pinhole
@@ -117,14 +118,16 @@ def check_agrees(name: str, matrix: Tensor | list[Tensor], camera: Camera, of: s
 
     of: whose camera it is, in words.
     """
-    agrees = isinstance(camera, Pinhole)
+    kinds = [one for _, one in camera.groups] if isinstance(camera, Mixed) else [camera]
+    lens = next((one for one in kinds if not isinstance(one, Pinhole)), None)
+    agrees = lens is None
     if agrees and len(matrix):
         ours = numbers_of(matrix) if isinstance(matrix, Tensor) else torch.stack([numbers_of(row) for row in matrix])
         near = max(_ALIKE, 2 * torch.finfo(matrix[0].dtype).eps)
         theirs = camera.intrinsics.detach().to(ours)
         agrees = not known_false(torch.isclose(ours.detach(), theirs, near, _ALIKE))
     if not agrees:
-        kind = "cameras of several models" if camera.is_mixed else f"a {type(camera).__name__} of other numbers"
+        kind = "a Pinhole of other numbers" if lens is None else f"a {type(lens).__name__}, which is more than a matrix"
         raise ValueError(
             f"{owner}: {name} must be the camera of the image, and agree with another one; got {of}, {kind}. Leave one "
             f"of both out, or keep the matrix unchanged with fields={{{name!r}: 'keep'}}"

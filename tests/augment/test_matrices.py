@@ -59,6 +59,10 @@ def of_matrix(matrix, size=SIZE):
     return ct.Pinhole.from_matrix(matrix[..., :3, :3], image_size=size).requires_grad_(False)
 
 
+def fisheye_of(size):
+    return ct.KannalaBrandt.from_fov(60, image_size=size)
+
+
 def check_labels(out, name="K"):
     off = (projected(out[name], out["points"]) - out["keypoints"])[out["keypoints_valid"]]
     assert off.numel() == 0 or off.abs().max() < 0.01
@@ -142,9 +146,13 @@ def test_who_wins():
     same, other = of_matrix(fields["K"]), ct.Pinhole.from_fov(60, image_size=SIZE)
     assert torch.equal(A.Resize(SIZE, camera=60)(fields)["camera"].intrinsics, same.intrinsics)  # K, else the number
     check_labels(A.RandomMount()(fields, camera=same))
+    check_labels(A.RandomMount()(fields, camera=[same[0], same[1]]))
+    for lens in (ct.BrownConrady(same[0].intrinsics, torch.zeros(5), image_size=SIZE), [same[0], fisheye_of(SIZE)]):
+        with pytest.raises(ValueError, match=r"got the camera of the sample, a (BrownC|KannalaB).*more than a matrix"):
+            A.RandomMount()(fields, camera=lens)
     chain = torch.nn.Sequential(A.RandomMount(), A.HorizontalFlip(), A.RandomMount(camera=60))
     check_labels(chain(fields))  # the second finds a camera beside K, which agrees
-    fisheye = ct.KannalaBrandt.from_fov(60, image_size=SIZE)
+    fisheye = fisheye_of(SIZE)
     for wrong in (other, fisheye, [fisheye, other]):
         for message, call in (
             ("camera of the sample", lambda wrong=wrong: A.RandomMount()(fields, camera=wrong)),
