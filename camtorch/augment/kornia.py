@@ -86,9 +86,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     ):
         name = type(self).__name__
         check_front_end(name, augmentation)
-        camera = augmentation.camera if camera is None else camera
-        if isinstance(camera, (int, float)) and not isinstance(camera, (bool, Guess)):
-            camera = Guess.of(camera, name)
+        camera = Guess.instead(augmentation.camera if camera is None else camera, name)
         if not isinstance(camera, (Camera, Guess)):
             raise TypeError(f"{name}: camera must be the Camera of the images; got {no_camera(camera)}")
         super().__init__(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import logging
+import numbers
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import torch
 from torch import Tensor
@@ -31,6 +32,12 @@ _log = logging.getLogger(__name__)
 
 class Guess(float):
     """Degrees across of the pinhole camera that stands in for the unknown one of photographs, of any size."""
+
+    @classmethod
+    def instead(cls, camera: Any, owner: str) -> Any:
+        """Return a number as a `Guess`, and all else as it is."""
+        is_number = isinstance(camera, numbers.Real) and not isinstance(camera, (bool, Guess))
+        return cls.of(camera, owner) if is_number else camera
 
     @classmethod
     def of(cls, degrees: float, owner: str) -> Guess:

@@ -94,8 +94,10 @@ class KeepsCamera:
     _name: str = ""  # in errors; empty: that of the class
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name == "camera" and isinstance(value, (int, float)) and not isinstance(value, (bool, Guess)):
-            value = Guess.of(value, self._name or type(self).__name__)
+        if name == "camera":
+            value = Guess.instead(value, self._name or type(self).__name__)
+            if isinstance(value, Guess):  # a module takes no other value for the name of one of its parts
+                self.__dict__.get("_modules", {}).pop(name, None)
         if name == "camera" and not (value is None or isinstance(value, (Camera, Guess))):
             raise TypeError(f"{self._name or type(self).__name__}: camera must be a Camera; got {no_camera(value)}")
         if name in ("camera", "like") and isinstance(value, Camera):

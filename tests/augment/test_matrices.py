@@ -256,6 +256,19 @@ def test_a_number_is_a_pinhole_for_images_of_any_size(name):
         assert torch.equal(listed["image"][1], out["image"][1])
 
 
+def test_a_number_takes_the_place_of_a_camera():
+    camera, fields = ct.Pinhole.from_fov(90, image_size=SIZE), {"image": torch.rand(3, *SIZE)}
+    images = {"image": np.zeros((*SIZE, 3), np.uint8)}
+    augment, transform = A.Resize(SIZE, camera=camera), camtorch.augment.numpy.Transform(A.Resize(SIZE), camera)
+    for one, sample in ((augment, fields), (transform, images)):
+        assert float(one(**sample)["camera"].fov[0]) == pytest.approx(90)
+        for number in (60, np.float32(60), np.int64(60)):
+            one.camera = number
+            assert float(one(**sample)["camera"].fov[0]) == pytest.approx(60)
+            one.camera = camera
+            assert float(one(**sample)["camera"].fov[0]) == pytest.approx(90)
+
+
 def test_a_guess_is_told_once(caplog):
     matrices._tell.cache_clear()
     matrices._guessed.cache_clear()
