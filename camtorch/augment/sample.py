@@ -294,8 +294,14 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def _check_matrices(self, batch: Batch, sample: Sample) -> Batch:
         """Return a batch; raise a ValueError if its fields K are not its camera, or cannot be the new one's."""
-        of = "the camera of the sample" if sample.get("camera") is not None else "that of the augmentation"
-        for name, kind in batch.plan.fields.items():
+        kinds = batch.plan.fields.items()
+        if not isinstance(sample.get("camera"), (Guess, type(None))):
+            of = "the camera of the sample"
+        elif isinstance(self.camera, Camera):
+            of = "that of the augmentation"
+        else:  # the first matrix is the camera
+            of = next((f"that of {name}" for name, kind in kinds if kind == "K"), "")
+        for name, kind in kinds:
             if kind == "K":
                 matrices.check_agrees(name, batch.plan.rows(batch.values[name]), batch.camera, of, self._name)
                 if not self.makes_pinholes:

@@ -163,7 +163,7 @@ def test_who_wins():
             for _ in range(2):
                 with pytest.raises(ValueError, match=rf"K must be the camera.*{message}.*fields=\{{'K': 'keep'\}}"):
                     call()
-    with pytest.raises(ValueError, match="intrinsics must be the camera"):
+    with pytest.raises(ValueError, match=r"intrinsics must be the camera.*got that of K"):
         A.RandomMount()(fields, intrinsics=matrix_of(3) * torch.tensor([2.0, 2, 1])[:, None])
     used = A.RandomMount(camera=same[0])
     once = {n: v[0] for n, v in fields.items()}
