@@ -123,9 +123,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
         """Draw numbers as `Augmentation.draw` does after its gate; images must be of the camera's image_size."""
         count = batch_shape[0]
         camera = self.camera_for(batch_shape[-2:])
-        if isinstance(self.camera, Guess):
-            self._set_size(cast("tuple[int, int]", camera.image_size))
-        check_single(type(self).__name__, camera, [("images", tuple(batch_shape[-2:]))])
+        self._set_size(check_single(type(self).__name__, camera, [("images", tuple(batch_shape[-2:]))]))
         if count:
             self.augmentation.tell_of_empty_images(camera)
         drawn = self.augmentation.drawn(count, 1.0, self.same_on_batch)

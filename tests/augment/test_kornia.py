@@ -428,6 +428,15 @@ def test_a_kornia_that_lacks_a_part_is_refused_by_its_name(owner, name, monkeypa
         runpy.run_path(kornia_parts.__file__)
 
 
+def test_the_size_of_new_images_follows_another_camera():
+    aug = adapter.CameraAugmentation(augment.Resize(40), camera=60)
+    cameras = [ct.Pinhole.from_fov(60, image_size=size) for size in ((200, 100), (100, 200))]
+    for given, size in ((60, SIZE), (cameras[0], (200, 100)), (cameras[1], (100, 200)), (60, (50, 60))):
+        aug.camera = given
+        out = aug(images(2, size=size))
+        assert aug._params["output_size"].tolist() == [list(out.shape[-2:])] * 2
+
+
 def test_labels_follow_a_lens_in_the_container_in_which_theirs_stay_behind():
     """kornia#4420: its fisheye and its elastic map move images, and no keypoints and boxes."""
     spot = torch.zeros(1, 1, *SIZE)
