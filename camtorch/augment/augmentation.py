@@ -20,7 +20,7 @@ from camtorch.augment.ranges import Range, draw
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
-from camtorch.evaluate.door import may_look
+from camtorch.evaluate.door import has_tangent, keeps_graph, may_look
 from camtorch.evaluate.tensors import are_known, are_numbers, known_false, known_true
 from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_part, as_whole, hinting, warn
 from camtorch.values.module import typed_as
@@ -455,6 +455,8 @@ class Augmentation(SampleTransform):
 
 
 def _are_alike(value: Any) -> bool:
-    """Whether all rows of an array or a tensor are known to be the same."""
+    """Whether all rows of an array or a tensor are known to be the same, and none has a derivative of its own."""
+    if isinstance(value, Tensor) and (keeps_graph(value) or has_tangent(value)):
+        return False
     same = value == value[:1]
     return same.size > 0 and bool(same.all()) if isinstance(same, np.ndarray) else known_true(same)

@@ -195,6 +195,18 @@ def test_gradients_reach_the_boxes_of_samples():
         ct.augment.BoxCrop(SIZE, index=[0, 1])
 
 
+def test_boxes_that_begin_alike_have_gradients_of_their_own():
+    camera = wide(dtype=torch.float64)
+    box = torch.tensor([[200.0, 120, 300, 260]], dtype=torch.float64)
+    images, factors = torch.zeros(3, 1, 480, 640), torch.tensor([[1.0], [10], [100]])
+    for parts in ([ct.augment.BoxCrop(SIZE)], [ct.augment.BoxCrop(SIZE), ct.augment.HorizontalFlip(p=1.0)]):
+        boxes = box.repeat(3, 1, 1).requires_grad_()
+        new = ct.augment.Compose(parts, camera=camera)(image=images, boxes=boxes)["camera"]
+        (gradient,) = torch.autograd.grad((new.intrinsics * factors).sum(), boxes)
+        assert gradient[0].abs().min() > 0
+        torch.testing.assert_close(gradient, gradient[:1] * factors[..., None])
+
+
 def test_several_cameras_of_a_sample_are_flattened():
     camera, images = wide(), torch.zeros(2, 3, 1, 480, 640)
     mount = ct.augment.RandomMount(yaw=2)
