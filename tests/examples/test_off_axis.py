@@ -65,6 +65,7 @@ def test_an_exact_network_is_right_by_look_at_and_off_by_the_angle_in_plain_crop
         assert np.asarray(image.convert("RGB")).std() > 20
 
 
+@pytest.mark.slow
 def test_a_box_tells_where_the_thing_is(tmp_path):
     marker(tmp_path / "marker.png")
     (photograph,) = stress_test.photographs([tmp_path / "marker.png"], 12, {"marker.png": [50, 60, 190, 200]})
@@ -74,6 +75,7 @@ def test_a_box_tells_where_the_thing_is(tmp_path):
         stress_test.photographs([tmp_path / "marker.png"], 12, {})
 
 
+@pytest.mark.slow
 def test_a_thing_that_is_not_found_is_counted(tmp_path):
     marker(tmp_path / "marker.png")
     things = stress_test.photographs([tmp_path / "marker.png"], 12, None)
