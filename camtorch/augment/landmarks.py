@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from camtorch.augment.change import gated
+from camtorch.augment.fields import Named
 from camtorch.values.arguments import as_flag, as_whole, shown, warn
 
 
@@ -198,6 +200,45 @@ class Mirroring:
                         )
                     found += [(name, other)] if mine == _LEFT else []
         return found
+
+    def exchange(self, moved: dict[str, Any], named: Named, mirrored: Tensor | None, batched: bool, owner: str) -> None:
+        """Let landmarks and fields of a moved sample change places where they are seen in a mirror, (B,) bool."""
+        sides = self.sides(named)  # that none lacks the other, whatever was drawn
+        others = (name for name in moved if name.rpartition("/")[2] in self.by_name and name not in named)
+        kept = {name: (None, moved[name]) for name in others}
+        for name, (_, value) in kept.items():  # what says something of each landmark, and does not move itself
+            several = isinstance(value, (list, tuple)) and all(isinstance(v, (Tensor, np.ndarray)) for v in value)
+            if not several and not isinstance(value, (Tensor, np.ndarray)):
+                raise TypeError(
+                    f"{owner}: {name} has a table of landmarks, and must be a tensor of (B, N, ...); got "
+                    f"{type(value).__name__}"
+                )
+            moved[name] = [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
+        pixels = [one for kind, value in named.values() for one in _items(value) if kind in ("keypoints", "landmarks")]
+        faces = {tuple(one.shape[1:3]) for one in pixels if one.ndim == 4}  # (F, N)
+        keys = {key for name in (*named, *kept) for key in (name, f"{name}_valid") if key in moved}
+        single = {key for key in keys if not (batched or isinstance(moved[key], list))}
+        moved |= {key: moved[key][None] for key in single}
+        for name, (found, _) in {**named, **kept}.items():
+            for key, flags in ((name, found is None), (f"{name}_valid", True)):
+                if key not in keys:
+                    continue
+                items = _items(moved[key])
+                rows = torch.zeros(sum(map(len, items)), dtype=torch.bool) if mirrored is None else mirrored
+                each = rows.split(1) if isinstance(moved[key], list) else [rows]
+                pairs = zip(items, each, strict=False)
+                swapped = [self.swapped(name, found, value, row, flags, faces) for value, row in pairs]
+                moved[key] = [v[0] for v in swapped] if isinstance(moved[key], list) else swapped[0]
+        for left, right in sides if mirrored is not None else ():
+            for one, other in ((left, right), (f"{left}_valid", f"{right}_valid")):
+                if one in keys and other in keys:
+                    moved[one], moved[other] = exchanged(moved[one], moved[other], cast("Tensor", mirrored))
+        moved |= {key: moved[key][0] for key in single}
+
+
+def _items(value: Any) -> list[Tensor]:
+    """Return a list of tensors as batches of one, a batch as the only one."""
+    return [one[None] for one in value] if isinstance(value, list) else [value]
 
 
 def exchanged(one: Any, other: Any, rows: Tensor) -> tuple[Any, Any]:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 NAMES = "K", "intrinsics", "camera_matrix"
 SHAPE = "(B, 3, 3) or (B, 4, 4), [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of the image"
+_SKEW = 1e-6  # parts of the focal length: a skew up to there is none
 _ALIKE = 1e-5  # relative: matrices that were float32 on the way are the same ones
 _told: set[str] = set()  # who warned of a matrix of another image in this process
 _log = logging.getLogger(__name__)
@@ -76,6 +77,8 @@ def hint(name: str, value: Tensor, batched: bool) -> str:
     """Return what to do about a wrong shape of a matrix K."""
     if value.shape[-2:] in ((3, 3), (4, 4)) and batched and value.ndim == 2:
         return f"One that all samples share goes in as {name}.expand(B, -1, -1)"
+    if value.shape[-2:] == (3, 4):
+        return f"Of [K | 0] pass K, {name}[..., :3]"
     if value.shape[-1:] == (4,):
         return "Numbers fx, fy, cx, cy go in as camera=ct.Pinhole(numbers, image_size=(height, width))"
     return f"If it is something else, fields={{{name!r}: 'keep'}} keeps it unchanged"
@@ -89,7 +92,10 @@ def check(name: str, value: Tensor, owner: str) -> None:
     free = torch.zeros_like(wanted, dtype=torch.bool)
     free[0, 0] = free[1, 1] = free[0, 2] = free[1, 2] = True
     free[3:, 3:] = True
-    wrong = ~(torch.where(free, torch.isfinite(given), given == wanted).flatten(-2).all(-1))
+    as_wanted = given == wanted
+    for row, column in ((0, 1), (1, 0)):  # which rounding may leave of a product of matrices
+        as_wanted[..., row, column] |= given[..., row, column].abs() <= _SKEW * given[..., 0, 0]
+    wrong = ~(torch.where(free, torch.isfinite(given), as_wanted).flatten(-2).all(-1))
     wrong = wrong | (given[..., 0, 0] <= 0) | (given[..., 1, 1] <= 0)
     if known_false(~wrong):
         one = given.reshape(-1, *given.shape[-2:])[wrong.reshape(-1)][0].tolist()

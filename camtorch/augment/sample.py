@@ -13,7 +13,6 @@ from dataclasses import replace
 from threading import get_ident
 from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast, get_args, get_origin, get_type_hints
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from typing_extensions import Self, Unpack
@@ -38,11 +37,12 @@ from camtorch.augment.fields import (
     kind_of,
     warn_of_numbers,
 )
-from camtorch.augment.landmarks import Mirroring, exchanged
+from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess
 from camtorch.augment.place import PLACE
 from camtorch.augment.plan import Batch, Plan
 from camtorch.augment.ranges import Spans
+from camtorch.augment.sizes import check_cameras, check_one_size
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept
@@ -63,7 +63,6 @@ from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import GeometryModule
 from camtorch.values.threads import on_one_thread
 from camtorch.warp.sampling import Options, as_options
-from camtorch.warp.warp import as_sized
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -282,7 +281,7 @@ class SampleTransform(KeepsCamera, nn.Module):
                 )
             if found in IMAGES:
                 items = value if isinstance(value, list) else [value]
-                self._check_one_size(name, {(one.shape[-2], one.shape[-1]) for one in items})
+                check_one_size(name, {(one.shape[-2], one.shape[-1]) for one in items}, self._name)
                 size = items[0].shape[-2], items[0].shape[-1]
                 if matrix is not None:
                     return matrices.camera_of(*matrix, size, self._name)
@@ -380,7 +379,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         if known is not None:
             batch = Batch(known[2], sample, camera, predicted)
             return self._check_matrices(batch, sample) if "K" in batch.plan.fields.values() else batch
-        batch = self._check_matrices(self._checked_batch(sample, camera, fields, predicted), sample)
+        batch = self._check_matrices(self._new_batch(sample, camera, fields, predicted), sample)
         if form is not None and batch.camera is camera and all(v is sample[n] for n, v in batch.values.items()):
             self._calls.plans((), form, lambda: batch.plan)
         return batch
@@ -405,7 +404,7 @@ class SampleTransform(KeepsCamera, nn.Module):
                 return None
         return *parts, is_free, self._calls.revision, *fields.items()
 
-    def _checked_batch(self, sample: Sample, camera: Any, fields: Mapping[str, str], predicted: bool) -> Batch:
+    def _new_batch(self, sample: Sample, camera: Any, fields: Mapping[str, str], predicted: bool) -> Batch:
         named = self._moving(sample, fields)
         batched = not isinstance(sample, Single) and is_batch(named, camera)
         if not batched:
@@ -433,7 +432,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             count = own if count < 0 else count
             if own != count:
                 raise ValueError(f"{self._name}: {name} must be of {count} samples, as other fields; got {own}")
-        self._check_cameras(camera, count, named)
+        check_cameras(camera, count, named, self._name)
         held = {name: v for name, (_, value) in named.items() for v in (value if isinstance(value, list) else [value])}
         check_devices(self._name, **held)
         device, camera = next((v.device for v in held.values()), torch.device("cpu")), alone(as_one(camera))
@@ -450,53 +449,6 @@ class SampleTransform(KeepsCamera, nn.Module):
         calls = Kept() if are_free(*held.values()) else None
         plan = Plan({name: kind for name, (kind, _) in named.items()}, batched, count, masks, calls)
         return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, True)
-
-    def _check_cameras(self, camera: object, count: int, named: Named) -> None:
-        several = isinstance(camera, (list, tuple))
-        cameras: list[Any] = list(camera) if several else [camera]  # type: ignore[call-overload]
-        if not cameras:
-            raise ValueError(
-                f"{self._name}: camera must be a camera or a list of some; got an empty list. Samples may be none "
-                "with one camera"
-            )
-        if several and len(cameras) != count:
-            raise ValueError(f"{self._name}: camera must have one for each of {count} samples; got {len(cameras)}")
-        images = [(name, value) for name, (found, value) in named.items() if found in IMAGES]
-        for i, one in enumerate(cameras):
-            name = f"camera[{i}]" if several else "camera"
-            shape = tuple(as_sized(one, name, self._name).batch_shape)
-            if shape not in ((), (1,), (count,)) or (shape and len(cameras) > 1):
-                hint = f". Flatten cameras (B, N) to (B N): {name}=ct.cat(list(camera))" if len(shape) == 2 else ""
-                raise ValueError(
-                    f"{self._name}: {name} must have no batch dims, or those of {count} samples; got {shape}{hint}"
-                )
-            for field, value in images:
-                shapes = [v.shape for v in value] if isinstance(value, list) else [value.shape]
-                for shape in shapes[i : i + 1] if several and isinstance(value, list) else shapes:
-                    self._check_size(field, tuple(shape), name, one.image_size)
-        self._check_one_size("camera", {one.image_size for one in cameras})
-
-    def _check_one_size(self, name: str, sizes: set[tuple[int, int]]) -> None:
-        if len(sizes) > 1:
-            raise ValueError(
-                f"{self._name}: the images of a batch must be of one size; got {name} of {sorted(sizes)} (height, "
-                "width). Give the samples one by one, as a DataLoader's workers do, or resize them before"
-            )
-
-    def _check_size(self, field: str, shape: tuple[int, ...], name: str, size: tuple[int, int]) -> None:
-        if shape[-2:] == size:
-            return
-        if shape[-3:-1] == size:
-            to = "0, 3, 1, 2" if len(shape) == 4 else "2, 0, 1"
-            raise ValueError(
-                f"{self._name}: {field} must have its channels first; got {shape}, with the channels last. Pass "
-                f"{field}.permute({to}), of an array {field}.transpose({to}); camtorch.augment.numpy takes arrays as "
-                "they are"
-            )
-        raise ValueError(
-            f"{self._name}: {field} must be of {name}'s image_size {size}; got {shape[-2:]} (height, width). "
-            "camera.resize, .crop and .pad give the camera of an edited image"
-        )
 
     @on_samples
     def moved_by(
@@ -561,7 +513,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         if "rotation" not in plan.fields:
             moved["rotation"] = change.rotation.clone() if batched else change.single_rotation
         if self.mirroring is not None:
-            self._mirror(moved, batch.rows(), change.mirrored, batched)
+            self.mirroring.exchange(moved, batch.rows(), change.mirrored, batched, self._name)
         if not isinstance(change.parts[0].camera, Unknown):
             # the change keeps cameras of its own, to go back by
             target = change.several if batched else change.single
@@ -582,41 +534,6 @@ class SampleTransform(KeepsCamera, nn.Module):
             return seen
         whole = change.valid_mask()
         return whole if seen is None else seen & (whole if seen.ndim == 4 else whole[:, 0])
-
-    def _mirror(self, moved: Sample, named: Named, mirrored: Tensor | None, batched: bool) -> None:
-        """Let landmarks and fields of a moved sample change places where they are seen in a mirror."""
-        mirroring = cast("Mirroring", self.mirroring)
-        sides = mirroring.sides(named)  # that none lacks the other, whatever was drawn
-        others = (name for name in moved if name.rpartition("/")[2] in mirroring.by_name and name not in named)
-        kept = {name: (None, moved[name]) for name in others}
-        for name, (_, value) in kept.items():  # what says something of each landmark, and does not move itself
-            several = isinstance(value, (list, tuple)) and all(isinstance(v, (Tensor, np.ndarray)) for v in value)
-            if not several and not isinstance(value, (Tensor, np.ndarray)):
-                raise TypeError(
-                    f"{self._name}: {name} has a table of landmarks, and must be a tensor of (B, N, ...); got "
-                    f"{type(value).__name__}"
-                )
-            moved[name] = [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
-        pixels = [one for kind, value in named.values() for one in _items(value) if kind in ("keypoints", "landmarks")]
-        faces = {tuple(one.shape[1:3]) for one in pixels if one.ndim == 4}  # (F, N)
-        keys = {key for name in (*named, *kept) for key in (name, f"{name}_valid") if key in moved}
-        single = {key for key in keys if not (batched or isinstance(moved[key], list))}
-        moved |= {key: moved[key][None] for key in single}
-        for name, (found, _) in {**named, **kept}.items():
-            for key, flags in ((name, found is None), (f"{name}_valid", True)):
-                if key not in keys:
-                    continue
-                items = _items(moved[key])
-                rows = torch.zeros(sum(map(len, items)), dtype=torch.bool) if mirrored is None else mirrored
-                each = rows.split(1) if isinstance(moved[key], list) else [rows]
-                pairs = zip(items, each, strict=False)
-                swapped = [mirroring.swapped(name, found, value, row, flags, faces) for value, row in pairs]
-                moved[key] = [v[0] for v in swapped] if isinstance(moved[key], list) else swapped[0]
-        for left, right in sides if mirrored is not None else ():
-            for one, other in ((left, right), (f"{left}_valid", f"{right}_valid")):
-                if one in keys and other in keys:
-                    moved[one], moved[other] = exchanged(moved[one], moved[other], cast("Tensor", mirrored))
-        moved |= {key: moved[key][0] for key in single}
 
     @staticmethod
     def _one(change: Change, found: str, value: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor | None]:
@@ -640,8 +557,3 @@ class SampleTransform(KeepsCamera, nn.Module):
             raise ValueError(f"{self._name}: {name} must be {shapes}; got {[tuple(b.shape) for b in before]}")
         now = [v & b.to(v.device) for v, b in zip(now, before, strict=True)]
         return now if many else now[0]
-
-
-def _items(value: Any) -> list[Tensor]:
-    """Return a list of tensors as batches of one, a batch as the only one."""
-    return [one[None] for one in value] if isinstance(value, list) else [value]

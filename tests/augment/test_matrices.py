@@ -310,3 +310,13 @@ def test_a_dict_of_torchvision_gets_the_guessed_camera(kind, monkeypatch):
         assert by_matrix["K"][0, 2] == 23.5
         image, target = first(torch.rand(3, *SIZE), {"boxes": BOXES[0]})
         assert (tuple(image.shape), [*target]) == ((3, 64, 48), ["boxes"])
+
+
+def test_a_skew_of_rounding_is_none():
+    given = torch.tensor([[60.0, 1e-9, 31.5], [0, 60, 23.5], [0, 0, 1]], dtype=torch.float64)
+    flip, image = ct.augment.HorizontalFlip(p=1), torch.rand(3, 48, 64)
+    torch.testing.assert_close(flip(image=image, K=given)["K"], given)
+    with pytest.raises(ValueError, match="no skew"):
+        flip(image=image, K=given + torch.tensor([[0, 1e-3, 0], [0, 0, 0], [0, 0, 0]]))
+    with pytest.raises(ValueError, match=r"pass K, K\[\.\.\., :3\]"):
+        flip(image=image, K=given[:, [0, 1, 2, 2]])
