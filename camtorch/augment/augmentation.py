@@ -15,6 +15,7 @@ from camtorch.augment.change import Change, Part, alone, as_one, by_kinds, check
 from camtorch.augment.devices import Elsewhere, remember_camera, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, Named, as_corners
 from camtorch.augment.filling import enough, filled, scaled
+from camtorch.augment.matrices import Guess
 from camtorch.augment.place import PLACE, put_place
 from camtorch.augment.ranges import Range, draw
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
@@ -449,7 +450,8 @@ class Augmentation(SampleTransform):
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def extra_repr(self) -> str:
-        parts = [f"{name}={interval}" for name, interval in self.ranges.items()]
+        parts = [f"camera={self.camera:g}"] if isinstance(self.camera, Guess) else []
+        parts += [f"{name}={interval}" for name, interval in self.ranges.items()]
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])
 

@@ -320,3 +320,7 @@ def test_a_skew_of_rounding_is_none():
         flip(image=image, K=given + torch.tensor([[0, 1e-3, 0], [0, 0, 0], [0, 0, 0]]))
     with pytest.raises(ValueError, match=r"pass K, K\[\.\.\., :3\]"):
         flip(image=image, K=given[:, [0, 1, 2, 2]])
+
+
+def test_a_guess_is_shown():
+    assert "camera=60, yaw" in repr(ct.augment.RandomMount(camera=60))
