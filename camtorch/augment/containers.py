@@ -115,10 +115,15 @@ def camera_of(params: Params, own: Camera, device: torch.device | None) -> Camer
     return own if same else remade(own, intrinsics=intrinsics, distortion=distortion)
 
 
+_CODES: dict[str, int] = {}  # of names of models; compilers, which do not know zlib, look them up
+
+
 def kind_of_camera(camera: Camera) -> list[int]:
     """Return model, number of coefficients and image_size as integers, since params hold only tensors."""
     model = type_before_parametrizations(camera).__name__
-    return [zlib.crc32(model.encode()), camera.distortion.shape[-1], *(camera.image_size or (0, 0))]
+    if model not in _CODES:
+        _CODES[model] = zlib.crc32(model.encode())
+    return [_CODES[model], camera.distortion.shape[-1], *(camera.image_size or (0, 0))]
 
 
 def _fields(container: Any, sample: Sample, ours: list[FrontEnd], single: bool) -> tuple[Sample, dict[str, str]]:
