@@ -87,10 +87,16 @@ def _begin(pickled: bytes) -> None:
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles interrupts
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # removes the partial file
+    signal.signal(signal.SIGTERM, _end)
     threading.Thread(target=end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     _work = pickle.loads(pickled)
+
+
+def _end(*_: object) -> None:
+    # the executor may catch the exit, and wait for a lock that a killed process holds
+    signal.alarm(2)
+    sys.exit(1)  # removes the partial file
 
 
 def _attempt(pair: Pair, work: Work | None = None) -> Outcome:
