@@ -26,6 +26,7 @@
     ENTRY(int32_t, sample, Job *)                                                                                      \
     ENTRY(void, sample_images, const Images *)                                                                         \
     ENTRY(int32_t, classify, const Classification *)                                                                   \
+    ENTRY(void, lay, Laying *)                                                                                         \
     ENTRY(int64_t, geometry, const Rows *)                                                                             \
     ENTRY(int64_t, moves, const Move *)                                                                                \
     ENTRY(int64_t, lattices, const Lattices *)                                                                         \

@@ -187,6 +187,42 @@ def maker(images: Tensor, count: int, size: tuple[int, int]) -> Callable[[], Ten
     return functools.partial(torch.empty, shape, dtype=dtype, device="cpu", memory_format=layout(images))
 
 
+def lay(nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Return positions (B, h, w, 2) of all pixels of a lattice, see `Call`, -9 if there is none; and (B, h, w) bool."""
+    shape = cells.shape[0], *size
+    grid, mapped = _room((*shape, 2)), torch.empty(shape, dtype=torch.bool, device="cpu")
+    _lay(nodes.contiguous(), cells, exact, grid, mapped)
+    return grid, mapped
+
+
+def lay_vjp(grid: Tensor, cells: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the gradients of a lattice's nodes and `count` exact cells by those of its positions (B, h, w, 2)."""
+    (cameras, n, m), step = cells.shape, structs.STEP
+    nodes = torch.zeros(cameras, 2, n + 5, m + 5, dtype=torch.float32, device="cpu")
+    exact = torch.zeros(2, count, step, step, dtype=torch.float32, device="cpu")
+    _lay(nodes, cells, exact, grid.contiguous(), None)
+    return nodes, exact
+
+
+def _lay(nodes: Tensor, cells: Tensor, exact: Tensor, grid: Tensor, mapped: Tensor | None) -> None:
+    cells, exact = cells.contiguous(), exact.contiguous()
+    call = structs.Laying()
+    call.count, call.rows, call.columns = cells.shape
+    (call.height, call.width), call.exact_count = grid.shape[1:3], exact.shape[1]
+    if call.rows * structs.STEP < call.height or call.columns * structs.STEP < call.width:  # C would read elsewhere
+        raise ValueError(f"cells must be of {tuple(grid.shape[1:3])} pixels; got {tuple(cells.shape[1:])}")
+    call.nodes, call.cells, call.exact, call.grid = (t.data_ptr() for t in (nodes, cells, exact, grid))
+    call.mapped, call.is_transposed = None if mapped is None else mapped.data_ptr(), mapped is None
+    work, threads = functools.partial(loaded().camtorch_lay, call), thread_count()
+    spread(work, min(threads, call.count if mapped is None else -(-grid[..., 0].numel() // _TILE)))
+
+
+def _room(shape: tuple[int, ...]) -> Tensor:
+    if math.prod(shape) * 4 >= memory.LEAST:
+        return memory.empty(shape, torch.float32, torch.contiguous_format)
+    return torch.empty(shape, dtype=torch.float32, device="cpu")
+
+
 def classify(
     nodes: Tensor,
     mapped: Tensor,

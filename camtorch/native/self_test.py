@@ -64,6 +64,12 @@ def _answers(library: Library) -> Iterator[tuple[str, Iterable[float], Iterable[
     most = library.camtorch_classify(asked)
     yield "camtorch_classify", (cells.value, most), (CELL_CUBIC, 0)
 
+    grid, nodes[50] = (c_float * 128)(), 64  # v at the cell's first corner
+    laying = structs.Laying(nodes=at(nodes), cells=at(cells), grid=at(grid), mapped=at(valid), height=8, width=8)
+    laying.count = laying.rows = laying.columns = 1
+    library.camtorch_lay(laying)
+    yield "camtorch_lay", grid[:4], (0, 64, 0, 59.0625)
+
     exact = (c_double * (2 * structs.SQUARES))()
     lattices = structs.Lattices(move=move, cells=asked, exact=at(exact), narrow=at(nodes), used=left)
     move, asked, cells.value = lattices.move, lattices.cells, 0

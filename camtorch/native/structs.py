@@ -7,7 +7,7 @@ from ctypes import POINTER, c_char_p, c_double, c_int32, c_int64, c_uint32, c_vo
 
 from camtorch.native.structure import Calls, Numbers, Struct
 
-CHECKSUM = 3370701357
+CHECKSUM = 616279063
 
 UINT8 = 0
 BOOL = 1
@@ -272,6 +272,40 @@ class Classification(Struct):
     padding: int
     cells: int | None
     scratch: int | None
+
+
+class Laying(Struct):
+    """`Laying` of the headers."""
+
+    __slots__ = ()
+    _fields_ = (
+        ("nodes", c_void_p),
+        ("cells", c_void_p),
+        ("exact", c_void_p),
+        ("exact_count", c_int64),
+        ("grid", c_void_p),
+        ("mapped", c_void_p),
+        ("count", c_int64),
+        ("rows", c_int64),
+        ("columns", c_int64),
+        ("height", c_int64),
+        ("width", c_int64),
+        ("is_transposed", c_int64),
+        ("next", c_int64),
+    )
+    nodes: int | None
+    cells: int | None
+    exact: int | None
+    exact_count: int
+    grid: int | None
+    mapped: int | None
+    count: int
+    rows: int
+    columns: int
+    height: int
+    width: int
+    is_transposed: int
+    next: int
 
 
 class Part(Struct):
@@ -758,7 +792,7 @@ class Steps(Struct):
     left: int | None
 
 
-STRUCTS = Agreement, Job, Images, Classification, Part, Cameras, Domain, Rows, Move, Lattices, Turned, Together, Draws, Poses, Views, Steps
+STRUCTS = Agreement, Job, Images, Classification, Laying, Part, Cameras, Domain, Rows, Move, Lattices, Turned, Together, Draws, Poses, Views, Steps
 
 
 class Library(Calls):
@@ -768,6 +802,7 @@ class Library(Calls):
         "camtorch_sample": (c_int32, [POINTER(Job)]),
         "camtorch_sample_images": (None, [POINTER(Images)]),
         "camtorch_classify": (c_int32, [POINTER(Classification)]),
+        "camtorch_lay": (None, [POINTER(Laying)]),
         "camtorch_geometry": (c_int64, [POINTER(Rows)]),
         "camtorch_moves": (c_int64, [POINTER(Move)]),
         "camtorch_lattices": (c_int64, [POINTER(Lattices)]),
@@ -787,6 +822,7 @@ class Library(Calls):
     camtorch_sample: Callable[[Job], int]
     camtorch_sample_images: Callable[[Images], None]
     camtorch_classify: Callable[[Classification], int]
+    camtorch_lay: Callable[[Laying], None]
     camtorch_geometry: Callable[[Rows], int]
     camtorch_moves: Callable[[Move], int]
     camtorch_lattices: Callable[[Lattices], int]

@@ -7,19 +7,20 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial, reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
+from torch.autograd import Function
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.devices import sent
-from camtorch.evaluate.door import in_jit_trace, may_look, set_aside
+from camtorch.evaluate.door import in_jit_trace, is_eager, keeps_graph, may_look, set_aside
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_free, are_plain, is_unknown
 from camtorch.native.library import native_available
-from camtorch.native.sampler import classify
+from camtorch.native.sampler import classify, lay, lay_vjp
 from camtorch.native.structs import CELL_CUBIC, CELL_DOUBT, CELL_EMPTY, CELL_TODO, POSITIONS, STEP
 from camtorch.poses.rotations import turn
 from camtorch.projection.evaluation import compiled_of
@@ -111,21 +112,56 @@ class Lattice:
     def pixels(self) -> Sampling:
         """Pixel by pixel: a constant of what torch.jit.trace records, also where nobody has asked for it before."""
         with set_aside() if in_jit_trace() else nullcontext():
-            height, width = self.size
-            _, n, m = self.cells.shape
-            planes = interpolated(self.nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
-            blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))
-            some = self.cells != CELL_EMPTY
-            blocks.masked_fill_(~some[:, None, :, None, :, None], OUTSIDE)
-            seen = some[:, :, None, :, None].expand(-1, -1, STEP, -1, STEP).flatten(3, 4).flatten(1, 2)
-            camera, i, j = (self.cells >= 0).nonzero(as_tuple=True) if self.done is None else self.done.unbind()
-            if len(camera):
-                exact = self.exact if self.done is not None else self.exact[:, self.cells[camera, i, j].long()]
-                exact = exact.transpose(0, 1)  # (K, 2, 8, 8)
-                known = ~exact[:, 0].isnan()
-                blocks[camera, :, i, :, j] = torch.where(known[:, None], exact, OUTSIDE)
-                seen.unflatten(1, (n, STEP)).unflatten(3, (m, STEP))[camera, i, :, j] = known
-            return Sampling(planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width], None)
+            nodes, exact, cells = self.nodes, self.exact, self.cells
+            single = nodes.dtype == torch.float32 and self.done is None
+            if single and native_available() and is_eager(nodes, exact, cells):
+                grid, seen = _Pixels.apply(nodes, exact, cells, self.size)  # type: ignore[no-untyped-call]
+            else:
+                grid, seen = _pixel_by_pixel(nodes, exact, cells, self.size, self.done)
+            return Sampling(grid, seen, None)
+
+
+class _Pixels(Function):
+    """Positions of a lattice's pixels, and whether there are any, in compiled code; derived again, by torch."""
+
+    @staticmethod
+    def forward(ctx: Any, nodes: Tensor, exact: Tensor, cells: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        grid, seen = lay(nodes, cells, exact, size)
+        ctx.save_for_backward(nodes, exact, cells)
+        ctx.size = size
+        ctx.mark_non_differentiable(seen)
+        return grid, seen
+
+    @staticmethod
+    def backward(ctx: Any, by_grid: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        nodes, exact, cells = ctx.saved_tensors
+        if not torch.is_grad_enabled() and is_eager(by_grid):
+            return *lay_vjp(by_grid, cells, exact.shape[1]), None, None
+        leaves = nodes.detach().requires_grad_(), exact.detach().requires_grad_()
+        with torch.enable_grad():  # it is linear
+            grid, _ = _pixel_by_pixel(leaves[0], leaves[1], cells, ctx.size, None)
+        by_nodes, by_exact = torch.autograd.grad(grid, leaves, by_grid, create_graph=True, materialize_grads=True)
+        return by_nodes, by_exact, None, None
+
+
+def _pixel_by_pixel(
+    nodes: Tensor, exact: Tensor, cells: Tensor, size: tuple[int, int], done: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Return positions (B, h, w, 2) of a lattice's pixels, and whether there are any, bool (B, h, w); by torch."""
+    (height, width), (_, n, m) = size, cells.shape
+    planes = interpolated(nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
+    blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))
+    some = cells != CELL_EMPTY
+    blocks.masked_fill_(~some[:, None, :, None, :, None], OUTSIDE)
+    seen = some[:, :, None, :, None].expand(-1, -1, STEP, -1, STEP).flatten(3, 4).flatten(1, 2)
+    camera, i, j = (cells >= 0).nonzero(as_tuple=True) if done is None else done.unbind()
+    if len(camera):
+        exact = exact if done is not None else exact[:, cells[camera, i, j].long()]
+        exact = exact.transpose(0, 1)  # (K, 2, 8, 8)
+        known = ~exact[:, 0].isnan()
+        blocks[camera, :, i, :, j] = torch.where(known[:, None], exact, OUTSIDE)
+        seen.unflatten(1, (n, STEP)).unflatten(3, (m, STEP))[camera, i, :, j] = known
+    return planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width]
 
 
 @on_one_thread
@@ -286,8 +322,16 @@ def on_lattice(
     If fourth differences show that cubics may miss, positions in the middle of a cell and of its sides decide. There
     a cell's pixels come one by one, from quintics if these do not miss, else from the cameras, as at the limit of what
     is mapped. None if that is most of the image. An edge between four nodes alone is not seen. Positions outside of the
-    image that the padding does not need keep no tolerance; for "reflection" all do.
+    image that the padding does not need keep no tolerance; for "reflection" all do. If a camera or the rotation learns,
+    the nodes, and the pixels that come from the cameras, are computed again, with a graph.
     """
+    tensors = [*source.tensors, *target.tensors, *(() if rotation is None else (rotation,))]
+    if keeps_graph(*tensors):
+        if not is_eager(*tensors):
+            return None
+        with torch.no_grad():
+            found = on_lattice(source, target, rotation, tolerance, rows, padding)
+        return None if found is None else _with_graph(found, source, target, rotation, rows)
     like, (height, width) = _like(target), (len(rows), target.size_for("Warp")[1])
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
     if min(n, m) < FEWEST or not native_available():
@@ -311,6 +355,19 @@ def on_lattice(
     if most:
         computed = _compute(exact, rows.start, cells, (cells == CELL_TODO) | (cells == CELL_DOUBT), like)
     return Lattice(lattice, cells, computed, (height, width))
+
+
+def _with_graph(found: Lattice, source: Camera, target: Camera, rotation: Tensor | None, rows: range) -> Lattice:
+    """Return a lattice with the cells of one that was found without a graph."""
+    exact, (height, width) = partial(_positions, source, target, rotation, None), found.size
+    _, n, m = found.cells.shape
+    count = (n + 5) * (m + 5)
+    pixels = (kept_probes if count <= MOST_KEPT else kept_probes.__wrapped__)(rows, width, _like(target).dtype)
+    nodes = exact(pixels[:, :count])[0][:, 0].movedim(-1, 1).unflatten(2, (n + 5, m + 5))
+    todo, computed = found.cells >= 0, nodes.new_empty(2, 0, STEP, STEP)
+    if bool(todo.any()):
+        computed = _compute(exact, rows.start, found.cells, todo, _like(target))
+    return Lattice(nodes, found.cells, computed, (height, width))
 
 
 def coarse(size: tuple[int, ...]) -> tuple[int, int]:

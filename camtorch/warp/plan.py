@@ -301,7 +301,7 @@ class CameraPair(GeometryModule):
                     "that do. Use torch.onnx.export(dynamo=True) or torch.export; or make the map a constant by "
                     "warp.requires_grad_(False) and one call before"
                 )
-            return self.locate(range(self.target.size_for("Warp")[0]), padding, 0.0)
+            return self.locate(range(self.target.size_for("Warp")[0]), self._reach(padding), self.tolerance)
         if records_constants() and (constant := self._constant(padding)):
             return constant
         reach, tolerance = self._reach(padding), self.tolerance
@@ -334,7 +334,7 @@ class CameraPair(GeometryModule):
         if self.is_pinned or is_operator or torch.is_inference_mode_enabled():
             return
         if self.route() == "graph":
-            where = self.positions("graph")
+            where = self.locate(range(self.target.size_for("Warp")[0]), self.padding_mode, 0.0)
         else:
             where = self.positions("kept") if is_exporting() else self.computed(self.padding_mode, self.tolerance)
         self._kept.renew(lambda: Plan(where, self.padding_mode))
