@@ -231,8 +231,8 @@ def classify(
     source: tuple[int, int],
     tolerance: float,
     padding: str,
-) -> tuple[Tensor, int]:
-    """Return the kinds of cells (B, n, m) of a lattice, `CELL_EMPTY` and so on; and the most open ones of an image.
+) -> Tensor:
+    """Return the kinds of cells (B, n, m) of a lattice: `CELL_EMPTY`, `CELL_CUBIC`, `CELL_DOUBT` or `CELL_TODO`.
 
     Positions are `nodes` (B, 2, n + 5, m + 5) of float32 and `mapped` (B, n + 5, m + 5) bool, the last two dims without
     gaps; `rim` (B, 2 (w + h)) bool, contiguous: the target's top row, bottom row, left column and right column.
@@ -247,4 +247,5 @@ def classify(
     asked.node_strides[:], asked.mapped_stride, asked.rim_stride = nodes.stride()[:2], mapped.stride(0), rim.stride(0)
     asked.count, asked.rows, asked.columns, (asked.height, asked.width) = count, rows, columns, size
     (asked.source_height, asked.source_width), asked.tolerance, asked.padding = source, tolerance, PADDINGS[padding]
-    return cells, loaded().camtorch_classify(asked)
+    loaded().camtorch_classify(asked)
+    return cells

@@ -19,13 +19,14 @@ from camtorch.evaluate.devices import sent
 from camtorch.evaluate.door import in_jit_trace, is_eager, keeps_graph, may_look, set_aside
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_free, are_plain, is_unknown
+from camtorch.native import sampler
 from camtorch.native.library import native_available
-from camtorch.native.sampler import classify, lay, lay_vjp
-from camtorch.native.structs import CELL_CUBIC, CELL_DOUBT, CELL_EMPTY, CELL_TODO, POSITIONS, STEP
+from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_TODO, POSITIONS, STEP
 from camtorch.poses.rotations import turn
 from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.native_calls import Between
 from camtorch.values.threads import on_one_thread
+from camtorch.warp.cells import Exact, classify, lay_quintics, places, put, settle
 from camtorch.warp.panorama import goes_round, lengths, off_poles, within_turn
 
 OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
@@ -35,10 +36,6 @@ FEWEST = 8  # cells along a side from which on a lattice pays
 _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
 _kept_weights = Kept(4)  # on other devices, where each operator is a launch
 MOST_KEPT = 1 << 16  # nodes of a lattice whose pixels are kept for the next one
-
-Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Pixels (h, w, 2) for every camera, or (B, h, w, 2) for each its own, to positions (B or 1, h, w, 2) as of
-`grid_sample`, `OUTSIDE` where no ray is mapped, and bool (B or 1, h, w): whether one is."""
 
 
 class Sampling(NamedTuple):
@@ -126,7 +123,7 @@ class _Pixels(Function):
 
     @staticmethod
     def forward(ctx: Any, nodes: Tensor, exact: Tensor, cells: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        grid, seen = lay(nodes, cells, exact, size)
+        grid, seen = sampler.lay(nodes, cells, exact, size)
         ctx.save_for_backward(nodes, exact, cells)
         ctx.size = size
         ctx.mark_non_differentiable(seen)
@@ -136,7 +133,7 @@ class _Pixels(Function):
     def backward(ctx: Any, by_grid: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         nodes, exact, cells = ctx.saved_tensors
         if not torch.is_grad_enabled() and is_eager(by_grid):
-            return *lay_vjp(by_grid, cells, exact.shape[1]), None, None
+            return *sampler.lay_vjp(by_grid, cells, exact.shape[1]), None, None
         leaves = nodes.detach().requires_grad_(), exact.detach().requires_grad_()
         with torch.enable_grad():  # it is linear
             grid, _ = _pixel_by_pixel(leaves[0], leaves[1], cells, ctx.size, None)
@@ -334,7 +331,7 @@ def on_lattice(
         return None if found is None else _with_graph(found, source, target, rotation, rows)
     like, (height, width) = _like(target), (len(rows), target.size_for("Warp")[1])
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
-    if min(n, m) < FEWEST or not native_available():
+    if min(n, m) < FEWEST:
         return None
     native = _native(source, target, rotation, like)
     if native is None and not are_free(like):
@@ -348,12 +345,13 @@ def on_lattice(
     positions, mapped = exact(pixels)  # (B, 1, N, 2)
     lattice = positions[:, 0, :nodes].movedim(-1, 1).contiguous().unflatten(2, (n + 5, m + 5))
     mapped, rim = mapped[:, 0, :nodes].unflatten(1, (n + 5, m + 5)), mapped[:, 0, nodes:]
-    cells, most = classify(lattice.float(), mapped, rim, (height, width), size, tolerance, padding)
-    if most > n * m / 2:
+    find = sampler.classify if native_available() else classify
+    narrow, limits = lattice.float(), (size, tolerance, padding)
+    cells = find(narrow, mapped, rim, (height, width), *limits)
+    settle(exact, rows.start, cells, narrow, mapped, *limits)
+    if 8 * int((cells == CELL_TODO).sum((1, 2)).max()) > 7 * n * m:
         return None
-    computed = like.new_empty(2, 0, STEP, STEP)
-    if most:
-        computed = _compute(exact, rows.start, cells, (cells == CELL_TODO) | (cells == CELL_DOUBT), like)
+    computed = _compute(exact, rows.start, cells, lattice)
     return Lattice(lattice, cells, computed, (height, width))
 
 
@@ -403,33 +401,30 @@ def kept_probes(rows: range, width: int, dtype: torch.dtype) -> Tensor:
         return torch.cat((nodes.flatten(1), torch.cat([torch.stack(pair, -1) for pair in sides]).mT), 1).mT[None]
 
 
-def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor) -> Tensor:
-    """Return exact positions (2, K, 8, 8) of the cells to do (B, n, m), and write their places into `cells`.
+def _compute(exact: Exact, first: int, cells: Tensor, nodes: Tensor) -> Tensor:
+    """Return positions (2, K, 8, 8) of `CELL_TODO` and `CELL_QUINTIC` in (B, n, m), and write their places there.
 
-    Where what is mapped ends in one, its neighbours follow.
+    Where what is mapped ends in a cell, its neighbours are computed as well.
     """
-    parts, count = [like.new_empty(2, 0, STEP, STEP)], 0
-    done, places = torch.zeros_like(todo), cells.flatten(1)
-    offset = torch.arange(STEP, dtype=like.dtype, device=like.device)
+    parts, count, todo = [nodes.new_empty(2, 0, STEP, STEP)], 0, cells == CELL_TODO
+    done = torch.zeros_like(todo)
+    offset = torch.arange(STEP, dtype=nodes.dtype, device=nodes.device)
     while bool(todo.any()):
-        # as many cells of every camera as the one with the most has: more of them computed does no harm
-        most = int(todo.sum((1, 2)).max())
-        chosen = todo.flatten(1).to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
-        wanted = todo.flatten(1).gather(1, chosen)
+        chosen, wanted = places(todo)
         i, j = chosen // todo.shape[2], chosen % todo.shape[2]
         down, across = (i[..., None, None] * STEP + offset[:, None]), (j[..., None, None] * STEP + offset)
         pixels = torch.stack(torch.broadcast_tensors(across, down + first), -1)  # (B, most, 8, 8, 2)
         positions, known = exact(pixels.flatten(2, 3))
         part = torch.where(known, positions.movedim(-1, 0), torch.nan)
         parts.append(part.flatten(1, 2).unflatten(-1, (STEP, STEP)))
-        place = torch.arange(count, count + chosen.numel(), dtype=cells.dtype, device=cells.device).view_as(chosen)
-        places.scatter_(1, chosen, torch.where(wanted, place, places.gather(1, chosen)))
+        put(cells, chosen, wanted, torch.arange(count, count + chosen.numel(), device=cells.device).view_as(chosen))
         count += chosen.numel()
         done |= todo
         # the limit goes on where it is thinner than cells
         limit = torch.zeros_like(todo).flatten(1).scatter_(1, chosen, wanted & known.any(-1) & ~known.all(-1))
-        around = F.max_pool2d(limit.view_as(todo).to(like.dtype).unsqueeze(1), 3, 1, 1)[:, 0]
+        around = F.max_pool2d(limit.view_as(todo).to(nodes.dtype).unsqueeze(1), 3, 1, 1)[:, 0]
         todo = (around > 0) & ~done
+    parts.append(lay_quintics(nodes, cells, count))
     return torch.cat(parts, 1)
 
 

@@ -1,0 +1,151 @@
+"""The cells of a lattice: which of them polynomials through nodes may miss, and what is laid there instead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import reduce
+
+import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from torch import Tensor
+
+from camtorch.native.structs import CELL_CUBIC, CELL_DOUBT, CELL_EMPTY, CELL_QUINTIC, CELL_TODO, STEP
+
+Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Pixels (h, w, 2) for every camera, or (B, h, w, 2) for each its own, to positions (B or 1, h, w, 2) as of
+`grid_sample`, `OUTSIDE` where no ray is mapped, and bool (B or 1, h, w): whether one is."""
+
+# the numbers of `classify` and `settle` in native/kernel.c and native/geometry_moves.h
+_MISSED = 3 * 3 / 128  # of fourth differences: by how much cubics miss the middle of a cell, three times for safety
+_MARGIN, _OVERSHOOT = (
+    0.05,
+    0.5,
+)  # of half an image beyond which nothing is sampled; by which cubics may leave their nodes
+_FAR_OFF = 4  # pixels
+_PROBES = ((4, 0), (0, 4), (8, 4), (4, 8), (4, 4))  # across and down: the middles of a cell's sides, and its own
+_MIDDLE = {4: (0.0, -1 / 16, 9 / 16, 9 / 16, -1 / 16, 0.0), 6: tuple(w / 256 for w in (3, -25, 150, 150, -25, 3))}
+"""Weights of six nodes in the middle of a cubic through four of them, and of a quintic."""
+
+
+def classify(
+    nodes: Tensor,
+    mapped: Tensor,
+    rim: Tensor,
+    size: tuple[int, int],
+    source: tuple[int, int],
+    tolerance: float,
+    padding: str,
+) -> Tensor:
+    """Return the kinds of cells (B, n, m) int32 of a lattice; as `native.sampler.classify`, see there."""
+    n, m = nodes.shape[-2] - 5, nodes.shape[-1] - 5
+    half = nodes.new_tensor(source[::-1])[:, None, None] / 2
+    corners = nodes[:, :, 2:-2], nodes[..., 2:-2].mT
+    across, down = (reduce(lambda line, _: line.diff(dim=-1), range(4), lines).abs() for lines in corners)
+    # the largest of a cell's corners and the next ones on either side
+    across, down = (F.max_pool2d(most, 4, 1, 1) for most in (across, down.mT))
+    missed = (_MISSED * half * (across + down)).square()
+    high, low = F.max_pool2d(nodes[:, :, 1:-1, 1:-1], 4, 1), -F.max_pool2d(-nodes[:, :, 1:-1, 1:-1], 4, 1)
+    reach = _MARGIN + _OVERSHOOT * (high - low)
+    near = (high + reach > -1) & (low - reach < 1)
+    # beyond the border one coordinate does not matter, but the other one does
+    missed = (missed * near if padding == "border" else missed).sum(1)
+    near = near.all(1) if padding == "zeros" else near.new_ones(())
+    known = mapped[:, 1:-1, 1:-1].to(nodes.dtype)
+    every, some = -F.max_pool2d(-known, 4, 1), F.max_pool2d(known, 4, 1)
+    doubt = near & ~(missed <= tolerance * tolerance)
+    cells = torch.where(doubt, CELL_DOUBT, CELL_CUBIC).to(torch.int32)
+    cells.masked_fill_(every == 0, CELL_TODO).masked_fill_(some == 0, CELL_EMPTY)
+    # a pixel at the rim may say that the nodes do not tell all
+    down, across = (torch.arange(length, device=nodes.device) // STEP for length in size)
+    at = torch.cat((across, across + (n - 1) * m, down * m, down * m + (size[1] - 1) // STEP))
+    flat = cells.flatten(1)
+    camera, place = (rim != (flat[:, at] != CELL_EMPTY)).nonzero(as_tuple=True)
+    flat[camera, at[place]] = CELL_TODO
+    return cells
+
+
+def settle(
+    exact: Exact,
+    first: int,
+    cells: Tensor,
+    nodes: Tensor,
+    mapped: Tensor,
+    source: tuple[int, int],
+    tolerance: float,
+    padding: str,
+) -> None:
+    """Find out about cells in doubt: polynomials miss most in the middle of a cell and of its sides.
+
+    Where half the tolerance is kept there, or an image that ends in zeros is far off, they become `CELL_CUBIC`; or
+    `CELL_QUINTIC`, for polynomials through six nodes; the others are `CELL_TODO`. The target's first row is `first`.
+    """
+    doubt = cells == CELL_DOUBT
+    if not bool(doubt.any()):
+        return
+    chosen, wanted = places(doubt)
+    probes = nodes.new_tensor(_PROBES)
+    corners = torch.stack((chosen % cells.shape[2], chosen // cells.shape[2]), -1) * STEP
+    corners[..., 1] += first
+    positions, known = exact(corners.unsqueeze(2) + probes)
+    # (B, K, 2, 5), (B, K, 2, 6, 6)
+    cameras = torch.arange(len(cells), device=cells.device)[:, None]
+    positions, around = positions.movedim(-1, 2).to(nodes.dtype), _around(nodes, cameras, chosen)
+    half, limit = nodes.new_tensor(source[::-1]) / 2, tolerance * tolerance / 4
+
+    def missed(count: int) -> Tensor:
+        """Return squared pixels (B, K, 2, 5) between the probes and polynomials through `count` x `count` nodes."""
+        weights = nodes.new_tensor(_MIDDLE[count])
+        lines = (around * weights).sum(-1)
+        sides = (around[..., 2:4] * weights[:, None]).sum(-2)
+        said = torch.cat((lines[..., 2:3], sides, lines[..., 3:4], (lines * weights).sum(-1, keepdim=True)), -1)
+        return ((positions - said) * half[:, None]).square()
+
+    by_cubics, every = missed(4), known.all(-1)
+    is_cubic = by_cubics.sum(2).amax(-1) <= limit
+    if padding == "zeros":
+        seen = torch.cat((positions, around[..., 2, 2, None]), -1)
+        low, high = seen.aminmax(dim=-1)
+        reach = (high - low) / 2 + _FAR_OFF / half  # what lies between the places looked at
+        is_off = (by_cubics.amax(-1) < 1) & ((high + reach < -1) | (low - reach > 1))
+        is_cubic |= is_off.any(-1)
+    # a quarter of that, and of what cubics miss: where the curvature steps, quintics gain nothing, and swing
+    inside = _around(mapped[:, None], cameras, chosen).flatten(2).all(-1)
+    is_quintic = inside & (missed(6).sum(2).amax(-1) <= limit / 16)
+    kinds = torch.where(is_quintic, CELL_QUINTIC, CELL_TODO).masked_fill_(is_cubic, CELL_CUBIC)
+    kinds.masked_fill_(~every, CELL_TODO)
+    put(cells, chosen, wanted, kinds)
+
+
+def places(todo: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the places (B, K) of cells to do (B, n, m), of every camera as many as of the one with the most.
+
+    And bool (B, K): which of them are to be done. More of them computed does no harm.
+    """
+    flat = todo.flatten(1)
+    chosen = flat.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, : int(flat.sum(1).max())]
+    return chosen, flat.gather(1, chosen)
+
+
+def put(cells: Tensor, chosen: Tensor, wanted: Tensor, kinds: Tensor) -> None:
+    """Write kinds (B, K) into the chosen cells that are wanted."""
+    flat = cells.flatten(1)
+    flat.scatter_(1, chosen, torch.where(wanted, kinds.to(cells.dtype), flat.gather(1, chosen)))
+
+
+def lay_quintics(nodes: Tensor, cells: Tensor, count: int) -> Tensor:
+    """Return positions (2, K, 8, 8) of all `CELL_QUINTIC`, and write their places, from `count` on, into `cells`."""
+    some = cells == CELL_QUINTIC
+    camera, place = some.flatten(1).nonzero(as_tuple=True)
+    cells[some] = torch.arange(count, count + len(place), dtype=cells.dtype, device=cells.device)
+    t = torch.arange(STEP, dtype=torch.float64, device=nodes.device)[:, None] / STEP + 2
+    steps = range(6)
+    weights = torch.cat([reduce(torch.mul, [(t - k) / (j - k) for k in steps if k != j]) for j in steps], -1)  # (8, 6)
+    # torch may be told to multiply matrices of less than float64 in fewer bits
+    around = _around(nodes, camera, place).double()
+    return (weights @ around @ weights.mT).to(nodes.dtype).transpose(0, 1)
+
+
+def _around(nodes: Tensor, camera: Tensor, place: Tensor) -> Tensor:
+    """Return the nodes (*K, c, 6, 6) around cells of a camera each, of all nodes (B, c, n + 5, m + 5)."""
+    columns = nodes.shape[-1] - 5
+    return nodes.unfold(2, 6, 1).unfold(3, 6, 1)[camera, :, place // columns, place % columns]
