@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import reduce
 
@@ -39,22 +40,24 @@ def classify(
     """Return the kinds of cells (B, n, m) int32 of a lattice; as `native.sampler.classify`, see there."""
     n, m = nodes.shape[-2] - 5, nodes.shape[-1] - 5
     half = nodes.new_tensor(source[::-1])[:, None, None] / 2
-    corners = nodes[:, :, 2:-2], nodes[..., 2:-2].mT
-    across, down = (reduce(lambda line, _: line.diff(dim=-1), range(4), lines).abs() for lines in corners)
-    # the largest of a cell's corners and the next ones on either side
-    across, down = (F.max_pool2d(most, 4, 1, 1) for most in (across, down.mT))
+    across, down = nodes[:, :, 2:-2].diff(4).abs(), nodes[..., 2:-2].diff(4, dim=2).abs()
+    around, known = nodes[:, :, 1:-1, 1:-1], mapped[:, None, 1:-1, 1:-1].to(nodes.dtype)
+    # fourth differences at a cell's corners and the next ones on either side, and a cell's sixteen nodes
+    corners = F.pad(torch.cat((across, down), 1), (1, 1, 1, 1), value=-math.inf)
+    most = torch.cat((corners, around, -around, known, -known), 1)
+    for dim in (2, 3):  # the largest of each four
+        most = torch.maximum(most.narrow(dim, 1, most.shape[dim] - 1), most.narrow(dim, 0, most.shape[dim] - 1))
+        most = torch.maximum(most.narrow(dim, 2, most.shape[dim] - 2), most.narrow(dim, 0, most.shape[dim] - 2))
+    across, down, high, low, some, every = most.split((2, 2, 2, 2, 1, 1), 1)
     missed = (_MISSED * half * (across + down)).square()
-    high, low = F.max_pool2d(nodes[:, :, 1:-1, 1:-1], 4, 1), -F.max_pool2d(-nodes[:, :, 1:-1, 1:-1], 4, 1)
-    reach = _MARGIN + _OVERSHOOT * (high - low)
-    near = (high + reach > -1) & (low - reach < 1)
+    reach = _MARGIN + _OVERSHOOT * (high + low)
+    near = (high + reach > -1) & (low + reach > -1)
     # beyond the border one coordinate does not matter, but the other one does
     missed = (missed * near if padding == "border" else missed).sum(1)
-    near = near.all(1) if padding == "zeros" else near.new_ones(())
-    known = mapped[:, 1:-1, 1:-1].to(nodes.dtype)
-    every, some = -F.max_pool2d(-known, 4, 1), F.max_pool2d(known, 4, 1)
-    doubt = near & ~(missed <= tolerance * tolerance)
+    doubt = ~(missed <= tolerance * tolerance)
+    doubt = doubt & near.all(1) if padding == "zeros" else doubt
     cells = torch.where(doubt, CELL_DOUBT, CELL_CUBIC).to(torch.int32)
-    cells.masked_fill_(every == 0, CELL_TODO).masked_fill_(some == 0, CELL_EMPTY)
+    cells.masked_fill_(every[:, 0] == 0, CELL_TODO).masked_fill_(some[:, 0] == 0, CELL_EMPTY)
     # a pixel at the rim may say that the nodes do not tell all
     down, across = (torch.arange(length, device=nodes.device) // STEP for length in size)
     at = torch.cat((across, across + (n - 1) * m, down * m, down * m + (size[1] - 1) // STEP))
@@ -136,9 +139,10 @@ def lay_quintics(nodes: Tensor, cells: Tensor, count: int) -> Tensor:
     """Return positions (2, K, 8, 8) of all `CELL_QUINTIC`, and write their places, from `count` on, into `cells`."""
     some = cells == CELL_QUINTIC
     camera, place = some.flatten(1).nonzero(as_tuple=True)
+    if not len(place):
+        return nodes.new_empty(2, 0, STEP, STEP)
     cells[some] = torch.arange(count, count + len(place), dtype=cells.dtype, device=cells.device)
-    t = torch.arange(STEP, dtype=torch.float64, device=nodes.device)[:, None] / STEP + 2
-    steps = range(6)
+    t, steps = torch.arange(STEP, dtype=torch.float64)[:, None] / STEP + 2, range(6)
     weights = torch.cat([reduce(torch.mul, [(t - k) / (j - k) for k in steps if k != j]) for j in steps], -1)  # (8, 6)
     # torch may be told to multiply matrices of less than float64 in fewer bits
     around = _around(nodes, camera, place).double()

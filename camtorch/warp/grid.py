@@ -149,7 +149,8 @@ def _pixel_by_pixel(
     planes = interpolated(nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
     blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))
     some = cells != CELL_EMPTY
-    blocks.masked_fill_(~some[:, None, :, None, :, None], OUTSIDE)
+    if not (may_look(some) and bool(some.all())):
+        blocks.masked_fill_(~some[:, None, :, None, :, None], OUTSIDE)
     seen = some[:, :, None, :, None].expand(-1, -1, STEP, -1, STEP).flatten(3, 4).flatten(1, 2)
     camera, i, j = (cells >= 0).nonzero(as_tuple=True) if done is None else done.unbind()
     if len(camera):
@@ -351,7 +352,8 @@ def on_lattice(
     settle(exact, rows.start, cells, narrow, mapped, *limits)
     if 8 * int((cells == CELL_TODO).sum((1, 2)).max()) > 7 * n * m:
         return None
-    computed = _compute(exact, rows.start, cells, lattice)
+    computed = _compute(exact, rows.start, cells, cells == CELL_TODO, like)
+    computed = torch.cat((computed, lay_quintics(lattice, cells, computed.shape[1])), 1)
     return Lattice(lattice, cells, computed, (height, width))
 
 
@@ -401,14 +403,14 @@ def kept_probes(rows: range, width: int, dtype: torch.dtype) -> Tensor:
         return torch.cat((nodes.flatten(1), torch.cat([torch.stack(pair, -1) for pair in sides]).mT), 1).mT[None]
 
 
-def _compute(exact: Exact, first: int, cells: Tensor, nodes: Tensor) -> Tensor:
-    """Return positions (2, K, 8, 8) of `CELL_TODO` and `CELL_QUINTIC` in (B, n, m), and write their places there.
+def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor) -> Tensor:
+    """Return exact positions (2, K, 8, 8) of the cells to do (B, n, m), and write their places into `cells`.
 
-    Where what is mapped ends in a cell, its neighbours are computed as well.
+    Where what is mapped ends in one, its neighbours follow.
     """
-    parts, count, todo = [nodes.new_empty(2, 0, STEP, STEP)], 0, cells == CELL_TODO
+    parts, count = [like.new_empty(2, 0, STEP, STEP)], 0
     done = torch.zeros_like(todo)
-    offset = torch.arange(STEP, dtype=nodes.dtype, device=nodes.device)
+    offset = torch.arange(STEP, dtype=like.dtype, device=like.device)
     while bool(todo.any()):
         chosen, wanted = places(todo)
         i, j = chosen // todo.shape[2], chosen % todo.shape[2]
@@ -422,9 +424,8 @@ def _compute(exact: Exact, first: int, cells: Tensor, nodes: Tensor) -> Tensor:
         done |= todo
         # the limit goes on where it is thinner than cells
         limit = torch.zeros_like(todo).flatten(1).scatter_(1, chosen, wanted & known.any(-1) & ~known.all(-1))
-        around = F.max_pool2d(limit.view_as(todo).to(nodes.dtype).unsqueeze(1), 3, 1, 1)[:, 0]
+        around = F.max_pool2d(limit.view_as(todo).to(like.dtype).unsqueeze(1), 3, 1, 1)[:, 0]
         todo = (around > 0) & ~done
-    parts.append(lay_quintics(nodes, cells, count))
     return torch.cat(parts, 1)
 
 
@@ -435,16 +436,19 @@ def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
     form = nodes.dtype, wide, nodes.device
     weights, spread = _weights(*form) if nodes.is_cpu else _kept_weights((), form, lambda: _weights(*form))
     terms = (nodes[:, :, i : i + rows, None] * weights[:, i, None] for i in range(4))
-    lines = reduce(torch.add, terms).flatten(2, 3)
-    lines = lines.to(wide)
-    result = nodes.new_empty(*lines.shape[:-1], columns * STEP)
+    lines = reduce(torch.add, terms).flatten(0, 3).to(wide)
+    result = lines.new_empty(len(lines), columns * STEP)
     cells = _BLOCK // STEP
     with torch.autocast(nodes.device.type, enabled=False):
         for first in range(0, columns, cells):
             n = min(cells, columns - first)
-            block = lines[..., first : first + n + 3] @ spread[: n + 3, :n].flatten(1)
-            result[..., first * STEP : (first + n) * STEP] = block
-    return result
+            factors = lines[:, first : first + n + 3], spread[: n + 3, :n].flatten(1)
+            block = result[:, first * STEP : (first + n) * STEP]
+            if lines.requires_grad:
+                block.copy_(torch.mm(*factors))
+            else:
+                torch.mm(*factors, out=block)
+    return result.to(nodes.dtype).view(len(nodes), 2, rows * STEP, columns * STEP)
 
 
 def _weights(dtype: torch.dtype, wide: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
