@@ -68,11 +68,15 @@ class Drawn:
             self.own = self.camera()
         return self.own
 
-    def camera(self) -> Camera:
+    def camera(self, count: int | None = None) -> Camera:
+        """Return a new camera of these numbers; a count makes a batch of a single one."""
         if torch.is_inference_mode_enabled():  # what that makes could not be used in a graph later
             with torch.inference_mode(False), torch.no_grad():
-                return self.camera()
-        numbers, k = nn.Parameter(self.intrinsics.clone(), requires_grad=False), self.distortion.clone()
+                return self.camera(count)
+        numbers, k = self.intrinsics, self.distortion
+        if count is not None:
+            numbers, k = numbers.expand(count, -1), k.expand(count, -1)
+        numbers, k = nn.Parameter(numbers.clone(), requires_grad=False), k.clone()
         k = nn.Parameter(k, requires_grad=False) if k.shape[-1] else k
         return remade(self.base, intrinsics=numbers, distortion=k, image_size=self.image_size)
 
@@ -233,8 +237,8 @@ class Change:
     def several(self) -> Camera:
         """Return the cameras after, a batch of all samples; their own, not those of the change."""
         moves = self.parts[0].moves
-        if isinstance(moves, Drawn) and self._order is None and not self.mixed and moves.intrinsics.ndim == 2:
-            return moves.camera()
+        if isinstance(moves, Drawn) and self._order is None and not self.mixed:
+            return moves.camera(None if moves.intrinsics.ndim == 2 else self.count)
         return self.target.clone()
 
     @property

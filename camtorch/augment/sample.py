@@ -377,10 +377,10 @@ class SampleTransform(KeepsCamera, nn.Module):
         form = self._form_of(sample, camera, fields)
         known = None if form is None else self._calls.plans.entry((), form)
         if known is not None:
-            batch = Batch(known[2], sample, camera, predicted)
+            batch = Batch(known[2], sample, alone(camera), predicted)
             return self._check_matrices(batch, sample) if "K" in batch.plan.fields.values() else batch
         batch = self._check_matrices(self._new_batch(sample, camera, fields, predicted), sample)
-        if form is not None and batch.camera is camera and all(v is sample[n] for n, v in batch.values.items()):
+        if form is not None and batch.camera.intrinsics.device == camera.intrinsics.device and all(v is sample[n] for n, v in batch.values.items()):
             self._calls.plans((), form, lambda: batch.plan)
         return batch
 

@@ -291,7 +291,8 @@ class Camera(Freezable, Editable):
         intrinsics, distortion = self.intrinsics, self.distortion
         if intrinsics.ndim == distortion.ndim == 1:
             return _NO_BATCH
-        return broadcast_shapes(intrinsics.shape[:-1], distortion.shape[:-1])
+        shape, other = intrinsics.shape[:-1], distortion.shape[:-1]
+        return shape if shape == other else broadcast_shapes(shape, other)
 
     @property
     def K(self) -> Tensor:  # noqa: N802 (the field's name for it)

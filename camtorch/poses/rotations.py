@@ -13,6 +13,7 @@ from camtorch.optics.special import angle_per_radius, cos_root, cosc_root, sinc_
 from camtorch.values.arguments import Numbers, as_real, as_rows, as_values, check_devices
 
 _NEARLY = 1e-3  # the largest deviation of R R^T from the identity
+_FEW = 16  # matrices that plain numbers check faster than operators of torch do
 
 
 def rotation_matrix(rotation: Tensor) -> Tensor:
@@ -121,7 +122,7 @@ def as_rotation(rotation: Numbers | None, owner: str) -> Tensor | None:
     """Return the checked rotation of a warp, (3, 3) or (B, 3, 3), or None."""
     if rotation is None:
         return None
-    if type(rotation) is Tensor and rotation.shape == (3, 3) and is_right(rotation):
+    if type(rotation) is Tensor and rotation.ndim <= 3 and rotation.shape[-2:] == (3, 3) and is_right(rotation):
         return rotation if rotation.requires_grad else rotation.clone()
     rotation = as_real(rotation, "rotation", owner)
     if rotation.shape[-2:] != (3, 3) or rotation.ndim > 3:
@@ -134,14 +135,19 @@ def as_rotation(rotation: Numbers | None, owner: str) -> Tensor | None:
 
 
 def is_right(matrix: Tensor) -> bool:
-    """Whether (3, 3) is a rotation, by plain numbers, which take less time than one operator of torch."""
-    if not (matrix.dtype in (torch.float32, torch.float64) and are_free(matrix)):
+    """Whether (3, 3), or few (B, 3, 3), are rotations, by plain numbers: in less time than one operator of torch takes.
+
+    False for more than a few, and if values may not be read.
+    """
+    if not (matrix.dtype in (torch.float32, torch.float64) and matrix.numel() <= 9 * _FEW and are_free(matrix)):
         return False
-    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
-    squares = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
-    products = a * d + b * e + c * f, d * g + e * h + f * i, g * a + h * b + i * c
-    misses = max(max(squares) - 1, 1 - min(squares), max(products), -min(products))
-    return bool(misses < _NEARLY and a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0)
+    for (a, b, c), (d, e, f), (g, h, i) in [matrix.tolist()] if matrix.ndim == 2 else matrix.tolist():
+        squares = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
+        products = a * d + b * e + c * f, d * g + e * h + f * i, g * a + h * b + i * c
+        misses = max(max(squares) - 1, 1 - min(squares), max(products), -min(products))
+        if not (misses < _NEARLY and a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0):
+            return False
+    return True
 
 
 def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:

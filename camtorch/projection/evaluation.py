@@ -101,10 +101,12 @@ def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Na
         if intrinsics.dtype != dtype or distortion.dtype != dtype:
             return None
         if not intrinsics.ndim == distortion.ndim == 1:
-            batch, is_batch = camera.batch_shape, True
+            is_batch, batch = True, intrinsics.shape[:-1]
+            if distortion.shape[:-1] != batch:
+                batch = camera.batch_shape
+                intrinsics, distortion = (t.expand(*batch, t.shape[-1]) for t in (intrinsics, distortion))
             if len(batch) != 1:
                 return None
-            intrinsics, distortion = (t.expand(*batch, t.shape[-1]) for t in (intrinsics, distortion))
         native = rows_of(camera, intrinsics, distortion).native
         if native is None:
             return None

@@ -191,34 +191,34 @@ class BatchedModule(GeometryModule):
         Raises:
             TypeError: If it has no batch dims. IndexError: If an index is beyond them.
         """
-        self._need_batch("indexed")
-        key = index if isinstance(index, tuple) else (index,)
-        key = (*key, slice(None)) if any(part is Ellipsis for part in key) else (*key, ..., slice(None))
+        batch, key = self._needed_batch("indexed"), index
+        if type(index) is not int:  # the dim of numbers is the last one, which no index may take
+            parts = index if isinstance(index, tuple) else (index,)
+            key = (*parts, slice(None)) if any(part is Ellipsis for part in parts) else (*parts, ..., slice(None))
         tensors = {}
         for name in self.tensor_names:
             tensor = getattr(self, name)
             try:
-                tensors[name] = tensor.expand(*self.batch_shape, tensor.shape[-1])[key]
+                tensors[name] = (tensor if tensor.shape[:-1] == batch else tensor.expand(*batch, tensor.shape[-1]))[key]
             except (IndexError, TypeError, ValueError, RuntimeError) as error:
                 raise refused_index(self, index, error) from None
         return remade(self, **tensors)
 
     def __len__(self) -> int:
         """Return the size of the first batch dim."""
-        self._need_batch("counted")
-        return self.batch_shape[0]
+        return self._needed_batch("counted")[0]
 
     def __iter__(self) -> Iterator[Self]:
         """Iterate along the first batch dim."""
-        self._need_batch("iterated over")
-        return (self[i] for i in range(self.batch_shape[0]))
+        return (self[i] for i in range(self._needed_batch("iterated over")[0]))
 
     def __bool__(self) -> bool:
         return True
 
-    def _need_batch(self, what: str) -> None:
-        if not self.batch_shape:
+    def _needed_batch(self, what: str) -> torch.Size:
+        if not (batch := self.batch_shape):
             raise TypeError(f"{type(self).__name__}: it must have batch dims to be {what}; got a single one")
+        return batch
 
     def detach(self) -> Self:
         """Return the same values without a graph: the new module shares them with this one, and does not learn."""
