@@ -380,7 +380,8 @@ class SampleTransform(KeepsCamera, nn.Module):
             batch = Batch(known[2], sample, alone(camera), predicted)
             return self._check_matrices(batch, sample) if "K" in batch.plan.fields.values() else batch
         batch = self._check_matrices(self._new_batch(sample, camera, fields, predicted), sample)
-        if form is not None and batch.camera.intrinsics.device == camera.intrinsics.device and all(v is sample[n] for n, v in batch.values.items()):
+        is_there = form is not None and batch.camera.intrinsics.device == camera.intrinsics.device
+        if is_there and all(v is sample[n] for n, v in batch.values.items()):
             self._calls.plans((), form, lambda: batch.plan)
         return batch
 

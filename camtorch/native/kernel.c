@@ -1138,13 +1138,19 @@ INLINE int is_small(const Image *image) {
     return has_small_steps && image->width >= 8 && image->width < 32767 && image->height < 32767;
 }
 
+/* Whether what lies off an image, and is blended in, is a byte */
+INLINE int fills_bytes(const Job *job, const Image *image) {
+    int fits = 1;
+    int64_t c;
+    for (c = 0; c < image->channels && job->padding == ZEROS; c++)
+        fits &= job->fill[c] == (float)((const uint8_t *)job->fill_elements)[c];
+    return fits;
+}
+
 /* Makes pixels i ... n - 1 that lie anywhere: whole sixteens of planes, eights of channels side by side */
 INLINE void off_windows(Span *span, const Image *image, char *first, const Chunk *at, int64_t i, int64_t n, int mode,
                         int pixel) {
-    const uint8_t *fill = (const uint8_t *)span->job->fill_elements;
-    int fits = mode == BILINEAR && is_small(image); /* and what lies off the image is a byte */
-    int64_t c;
-    for (c = 0; c < image->channels && span->job->padding == ZEROS; c++) fits &= span->job->fill[c] == (float)fill[c];
+    const int fits = mode == BILINEAR && is_small(image) && fills_bytes(span->job, image);
     for (; i < n && fits; i += pixel == 1 ? 16 : STEP)
         anywhere(span->job, image, first + i * pixel, at->u + i, at->v + i, pixel);
     if (mode == NEAREST) eights(span, first, at, i, n, BYTES1, NEAREST, SCATTERED);
@@ -1282,6 +1288,8 @@ enum { MOST_ROWS = 24 };
 #define THREE_TIMES(i) i, i, i
 #define THREE(i) 0x0300, 0x0401, 0x0502
 static const int16_t PIXELS[96] = {REPEATED(THREE_TIMES)}, CHANNELS[96] = {REPEATED(THREE)};
+#define OF_THREE(i) 0, 1, 2
+static const uint8_t THIRDS[96] = {REPEATED(OF_THREE)}; /* channels of bytes */
 #define ODD(i) 2 * (i) + 1
 static const uint8_t UPPER[64] = {REPEATED(ODD)}; /* bytes of words */
 
@@ -1293,22 +1301,23 @@ typedef struct {
     int64_t rows;    /* none if there are no such windows */
 } Place;
 
-/* Positions hardly go any further between three of 32. Pixels of one element or of three. */
-INLINE void places_of(const Image *image, const float *u, const float *v, int64_t n, const int pixel, const int registers,
-                      Place *places) {
+/* Positions hardly go any further between three of 32. Pixels of one element or of three. `off`: whether the window may
+ * reach beyond the image, by a pixel on the left and above and by two on the other sides. */
+INLINE Place place_of(const Image *image, const float *u, const float *v, const int pixel, const int registers,
+                      const int off) {
     const int64_t most = 64 * registers / pixel;
-    const float last = (float)(image->width - most);
-    for (; n >= 32; n -= 32, u += 32, v += 32, places++) {
-        const float left = lesser(u[0], u[31]) - 1;
-        const float top = lesser(lesser(v[0], v[31]), v[16]) - 0.0625f;
-        const int64_t end = whole(greater(greater(v[0], v[31]), v[16]) + 0.0625f) + 2;
-        const int64_t x = whole(greater(lesser(left, last), 0)), y = whole(greater(top, 0));
-        const int64_t rows = (end < image->height ? end : image->height) - y;
-        places->x = (float)x, places->y = (float)y;
-        places->begin = y * image->below + pixel * x;
-        places->columns = image->width - x < most ? image->width - x : most;
-        places->rows = image->width >= 2 && rows >= 2 && rows <= MOST_ROWS ? rows : 0;
-    }
+    const float least = (float)-off, last = (float)(image->width - most + 2 * off);
+    const float left = lesser(u[0], u[31]) - 1;
+    const float top = lesser(lesser(v[0], v[31]), v[16]) - 0.0625f;
+    const int64_t end = whole(greater(greater(v[0], v[31]), v[16]) + 0.0625f) + 2;
+    const int64_t x = whole(greater(lesser(left, last), least) - least) - off, y = whole(greater(top, least) - least) - off;
+    const int64_t rows = (off || end < image->height ? end : image->height) - y;
+    Place place;
+    place.x = (float)x, place.y = (float)y;
+    place.begin = y * image->below + pixel * x;
+    place.columns = off || image->width - x > most ? most : image->width - x;
+    place.rows = image->width >= 2 && rows >= 2 && rows <= MOST_ROWS ? rows : 0;
+    return place;
 }
 
 /* The lower or upper halves of 32 numbers */
@@ -1331,9 +1340,18 @@ INLINE __m512i between_bytes(__m512i pairs, __m512i t) {
     return _mm512_add_epi16(sum, _mm512_mulhrs_epi16(difference, t));
 }
 
-/* Bytes of a window of so many registers, of which those are read that are `held` */
-INLINE __m512i found(const char *from, const __mmask64 *held, __m512i pick, const int registers) {
-#define LOADED(k) _mm512_maskz_loadu_epi8(held[k], from + 64 * (k))
+/* The bytes of a window, in registers, that lie on the image; and those off it */
+typedef struct {
+    __mmask64 held[4];
+    __m512i fill[4];
+} Bytes;
+
+/* Bytes of a row of a window of so many registers; `off`: the row lies off the image, or a part of it may */
+INLINE __m512i found(const char *from, const Bytes *bytes, const int is_there, __m512i pick, const int registers,
+                     const int off) {
+#define LOADED(k)                                                                                                      \
+    (off ? _mm512_mask_loadu_epi8(bytes->fill[k], is_there ? bytes->held[k] : 0, from + 64 * (k))                      \
+         : _mm512_maskz_loadu_epi8(bytes->held[k], from + 64 * (k)))
     const __m512i low = LOADED(0);
     if (registers == 1) return _mm512_permutexvar_epi8(pick, low);
     const __m512i first = _mm512_permutex2var_epi8(low, pick, LOADED(1));
@@ -1344,10 +1362,10 @@ INLINE __m512i found(const char *from, const __mmask64 *held, __m512i pick, cons
 }
 
 /* Whether all lie there, and are made: pixels of one byte or of three, in rows of so many registers. Positions are
- * rounded to 2^-16. */
+ * rounded to 2^-16. `fill` of the channels where the window lies `off` the image. */
 INLINE int bytes_at(const Image *image, const Place *place, char *result, const float *u, const float *v, const int pixel,
-                    const int registers, const int mode) {
-    const int64_t rows = place->rows;
+                    const int registers, const int mode, const int off, const uint8_t *fill) {
+    const int64_t rows = place->rows, x = (int64_t)place->x, y = (int64_t)place->y;
     int64_t c;
     int j, k;
     if (!rows) return 0;
@@ -1381,31 +1399,38 @@ INLINE int bytes_at(const Image *image, const Place *place, char *result, const 
             begins[k] = _mm512_permutexvar_epi16(which, row);
         }
     }
-    __mmask64 held[4];
+    Bytes bytes;
     for (k = 0; k < registers; k++) {
-        const int64_t bytes = place->columns * pixel - 64 * k;
-        held[k] = bytes >= 64 ? ~0ull : bytes > 0 ? ~0ull >> (64 - bytes) : 0;
+        const int64_t end = (off ? image->width - x : place->columns) * pixel - 64 * k, before = off ? -x * pixel - 64 * k : 0;
+        bytes.held[k] = end >= 64 ? ~0ull : end > 0 ? ~0ull >> (64 - end) : 0;
+        if (before > 0) bytes.held[k] &= ~0ull << before;
+        if (off && pixel > 1)
+            bytes.fill[k] = _mm512_permutexvar_epi8(_mm512_loadu_si512(THIRDS + k % 3),
+                                                    _mm512_set1_epi32(fill[0] | fill[1] << 8 | fill[2] << 16));
     }
+#define IS_THERE(j) (!off || (y + (j) >= 0 && y + (j) < image->height))
     const char *plane = image->source + place->begin;
     for (c = 0; c < (pixel == 1 ? image->channels : 1); c++, plane += image->from_plane, result += image->to_plane) {
         const char *from = plane + image->below;
         ask_below(from, image->below);
         if (pixel > 1) ask_below(from + 64, image->below);
+        for (k = 0; k < registers && off && pixel == 1; k++) bytes.fill[k] = _mm512_set1_epi8((char)fill[c]);
         for (k = 0; k < pixel; k++) {
-            upper[k] = found(plane, held, pick[k], registers);
-            last[k] = lower[k] = found(from, held, pick[k], registers);
+            upper[k] = found(plane, &bytes, IS_THERE(0), pick[k], registers, off);
+            last[k] = lower[k] = found(from, &bytes, IS_THERE(1), pick[k], registers, off);
         }
         for (j = 2; j < rows; j++) {
             const __m512i before = _mm512_set1_epi16((short)(j - 2));
             from += image->below;
             for (k = 0; k < pixel; k++) {
                 const __mmask32 below = _mm512_cmpgt_epi16_mask(begins[k], before);
-                const __m512i next = found(from, held, pick[k], registers);
+                const __m512i next = found(from, &bytes, IS_THERE(j), pick[k], registers, off);
                 upper[k] = _mm512_mask_mov_epi16(upper[k], below, last[k]);
                 lower[k] = _mm512_mask_mov_epi16(lower[k], below, next);
                 last[k] = next;
             }
         }
+#undef IS_THERE
         if (mode == NEAREST) {
             const __mmask32 below = _mm512_cmpge_epi16_mask(row, _mm512_set1_epi16((short)(rows - 1)));
             const __m512i value = _mm512_mask_mov_epi16(upper[0], below, lower[0]);
@@ -1427,15 +1452,48 @@ INLINE int bytes_at(const Image *image, const Place *place, char *result, const 
 
 #if WIDE
 
+/* Whether 32 pixels of which some lie off the image are made, in windows that reach beyond it */
+INLINE int bytes_around(const Job *job, const Image *image, char *result, const float *u, const float *v, const int pixel,
+                        const int registers, const int mode) {
+    const __m512 off = _mm512_set1_ps(-1);
+    _Alignas(64) float at[2][32];
+    int k;
+    for (k = 0; k < 4; k++) { /* what lies farther off, or is not a number, shows as little as the next pixels off it */
+        const float *from = (k < 2 ? u : v) + k % 2 * 16;
+        const __m512 side = _mm512_set1_ps((float)(k < 2 ? image->width : image->height));
+        _mm512_store_ps(at[k / 2] + k % 2 * 16, _mm512_min_ps(_mm512_max_ps(_mm512_loadu_ps(from), off), side));
+    }
+    const Place place = place_of(image, at[0], at[1], pixel, registers, 1);
+    return bytes_at(image, &place, result, at[0], at[1], pixel, registers, mode, 1, (const uint8_t *)job->fill_elements);
+}
+
+/* Apart from the pixels on the image, whose loops it would take registers from */
+NOT_INLINE int around(const Job *job, const Image *image, char *result, const float *u, const float *v, int pixel,
+                      int registers, int mode) {
+    if (job->padding != ZEROS || (mode != NEAREST && !(is_small(image) && fills_bytes(job, image)))) return 0;
+#define AROUND(pixel, registers, mode) bytes_around(job, image, result, u, v, pixel, registers, mode)
+    if (mode == NEAREST) return registers == 1 ? AROUND(1, 1, NEAREST) : AROUND(1, 2, NEAREST);
+    if (pixel == 1) return registers == 1 ? AROUND(1, 1, BILINEAR) : AROUND(1, 2, BILINEAR);
+    return registers == 2 ? AROUND(3, 2, BILINEAR) : AROUND(3, 4, BILINEAR);
+#undef AROUND
+}
+
+/* Makes pixels i ... n - 1, at least 32: the last of them again, if they fill no registers */
 INLINE void wide_bytes(Span *span, const Image *image, char *first, const Chunk *at, int64_t i, int64_t n,
                        const int pixel, const int registers, int mode) {
-    Place places[CHUNK / 32], *place = places;
-    places_of(image, at->u + i, at->v + i, n - i, pixel, registers, places);
-    for (; i < n; i += 32, place++) {
-        const float *u = at->u + i, *v = at->v + i;
-        if (!bytes_at(image, place, first + i * pixel, u, v, pixel, registers, mode))
-            off_windows(span, image, first, at, i, i + 32, mode, pixel);
+    Place places[CHUNK / 32];
+    int64_t k, begin;
+#define BEGIN(k) (i + 32 * (k) < n - 32 ? i + 32 * (k) : n - 32)
+    for (k = 0; i + 32 * k < n; k++) places[k] = place_of(image, at->u + BEGIN(k), at->v + BEGIN(k), pixel, registers, 0);
+    for (k = 0; i + 32 * k < n; k++) {
+        begin = BEGIN(k);
+        const float *u = at->u + begin, *v = at->v + begin;
+        char *result = first + begin * pixel;
+        if (!bytes_at(image, places + k, result, u, v, pixel, registers, mode, 0, NULL) &&
+            !around(span->job, image, result, u, v, pixel, registers, mode))
+            off_windows(span, image, first, at, begin, begin + 32, mode, pixel);
     }
+#undef BEGIN
 }
 
 /* Makes pixels i ... n - 1 of a row, up to the one that it returns */
@@ -1462,7 +1520,6 @@ INLINE int64_t wide(Span *span, char *first, const Chunk *at, int64_t i, int64_t
     const int64_t across = llabs((int64_t)whole(at->u[n - 1]) - whole(at->u[i])) * 32 / (n - i) + 5;
     const int64_t down = llabs((int64_t)whole(at->v[n - 1]) - whole(at->v[i])) * 32 / (n - i);
     if (down > MOST_ROWS || across > (in_planes ? 128 : 85)) return i;
-    n = i + (n - i) / 32 * 32;
     if (in_planes && across <= 64) wide_bytes(span, &image, first, at, i, n, 1, 1, mode);
     else if (in_planes) wide_bytes(span, &image, first, at, i, n, 1, 2, mode);
     else if (across <= 42) wide_bytes(span, &image, first, at, i, n, 3, 2, BILINEAR);
