@@ -57,7 +57,8 @@ def main(arguments: list[str] | None = None) -> None:
     start = time.perf_counter()
     for name in SUBJECTS if "all" in options.subject else options.subject:
         for row in SUBJECTS[name].rows(options):
-            results.setdefault(row.table, {})[row.name] = dict(row.figures)
+            if row.figures:
+                results.setdefault(row.table, {})[row.name] = dict(row.figures)
         for table in SUBJECTS[name].TABLES:
             if found := results.get(table.name):
                 print(f"\n### {table.name}\n\n{table.markdown([found], spread=True)}", flush=True)
@@ -86,6 +87,7 @@ def _parser() -> argparse.ArgumentParser:
     add("subject", nargs="*", choices=[*SUBJECTS, "all"], default="all", help="default: all")
     add("--size", type=int, metavar="N", help="points of the subject points (default: 1000000)")
     add("--model", nargs="+", choices=keys, default=[], metavar="KEY", help=f"only these models of {', '.join(keys)}")
+    add("--rows", default="", metavar="PATTERN", help="only rows whose name has this regular expression")
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where tensors live (default: cpu)")
     add("--threads", type=int, default=2, help="of torch and of OpenCV (default: 2)")
     add("--cpu", choices=list(_LIMITS), help="limit everyone to this kind of processor (default: what it is)")

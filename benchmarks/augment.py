@@ -19,20 +19,14 @@ from torch import Tensor
 
 import camtorch as ct
 from benchmarks import cameras
-from benchmarks.harness import NAMES, OPENCV, OURS, Options, Row, Run, Table, measure
+from benchmarks.harness import NAMES, OPENCV, OURS, Options, Row, Run, Table, measure, tv, v2
 from camtorch.augment import Compose, HorizontalFlip, RandomCamera, RandomLens, RandomResizedCrop
-
-try:
-    import torchvision.transforms.v2
-except (ImportError, RuntimeError):  # its binary is of another torch
-    torchvision = None
 
 AFFINE = "kornia RandomAffine"
 BY_SAMPLE, ONE_DRAW = "torchvision, by sample", "torchvision, one draw"
 BATCH, SIZE, QUICK_SIZE, LANDMARKS = 8, (480, 640), (120, 160), 68
 ANGLES = {"yaw": 10, "pitch": 10, "roll": 10, "min_filled": 0}
-_SHOWN = {who: (who,) for who in (OURS, AFFINE, OPENCV, BY_SAMPLE, ONE_DRAW)}
-TABLES = (Table("augment", f"{BATCH} images, ms", _SHOWN),)
+TABLES = (Table("augment", f"{BATCH} images, ms", (OURS, AFFINE, OPENCV, BY_SAMPLE, ONE_DRAW)),)
 _DEGREES = np.radians(10)
 _SHORTEST = 0.1  # seconds of a chain's round: of single calls the fastest is the luckiest draw
 
@@ -69,12 +63,6 @@ def rows(options: Options) -> Iterator[Row]:
     yield measure("augment", "crop, flip, lens, uint8", _chains(size, options), options, shortest=_SHORTEST)
 
 
-def affine_of(keys: list[str]) -> K.AugmentationSequential:
-    """Return kornia's affine map of about the same extent."""
-    affine = K.RandomAffine(10.0, translate=(0.02, 0.02), scale=(0.95, 1.05), p=1.0)
-    return K.AugmentationSequential(affine, data_keys=keys)
-
-
 def _contestants(case: Case, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> dict[str, Run]:
     """The batch moved by a new draw."""
     generator = torch.Generator().manual_seed(0)
@@ -86,7 +74,8 @@ def _contestants(case: Case, size: tuple[int, int], dtype: torch.dtype, device: 
         image, mask = (image * 255).byte(), mask.byte()
     camera = cameras.camera(case.source, device, size=size).requires_grad_(False)
     ours = RandomCamera(case.like, camera=camera, fov=case.fov, **ANGLES)
-    affine = affine_of(["input", "mask", "keypoints"])
+    affine = K.RandomAffine(10.0, translate=(0.02, 0.02), scale=(0.95, 1.05), p=1.0)
+    affine = K.AugmentationSequential(affine, data_keys=["input", "mask", "keypoints"])
 
     def by_affine() -> tuple[Tensor, ...]:
         moved = affine(image.float(), mask.float(), keypoints)
@@ -126,8 +115,7 @@ def _chains(size: tuple[int, int], options: Options) -> dict[str, Run]:
     chain = Compose([RandomResizedCrop(size), HorizontalFlip(landmarks={}), lens], camera=camera)
 
     runs: dict[str, Run] = {OURS: lambda: chain(image=images, keypoints=landmarks)}
-    if torchvision is not None:
-        v2, tv = torchvision.transforms.v2, torchvision.tv_tensors
+    if v2 is not None:
         theirs = v2.Compose([v2.RandomResizedCrop(size), v2.RandomHorizontalFlip()])
         batch = tv.Image(images), tv.KeyPoints(landmarks, canvas_size=size)
         samples = [tuple(tv.wrap(part[i], like=part) for part in batch) for i in range(BATCH)]

@@ -2,30 +2,48 @@
 
 import argparse
 import gc
+import importlib
 import math
 import os
 import platform
+import re
 import statistics
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import torch
+from torch import Tensor
 
 import camtorch
 from camtorch.native import library
 
 Run = Callable[[], object]
+progress = partial(print, file=sys.stderr, flush=True)  # what is being measured
 OURS, OPENCV, KORNIA = "camtorch", "OpenCV", "kornia"
+OPENCV_MAPS = "OpenCV, float map", "OpenCV, fixed-point map"
 WITHOUT_LIBRARY = "camtorch without its library"
 NAMES = {"kannala_brandt": "Kannala-Brandt", "brown_conrady": "Brown-Conrady", "fisheye624": "Fisheye624"}
 """Models as rows of tables call them, where that is not the key."""
+
+
+def _optional(name: str) -> Any:
+    """Return a module, or None if it is not installed, or its binary is of another torch."""
+    try:
+        return importlib.import_module(name)
+    except (ImportError, RuntimeError):
+        return None
+
+
+A, dc, kornia_rs = map(_optional, ("albumentations", "deltacamera", "kornia_rs"))
+v2, tv = map(_optional, ("torchvision.transforms.v2", "torchvision.tv_tensors"))
 
 _SHORTEST = 2e-3  # seconds: shorter calls are timed several at a time, as reading the clock takes a part of them
 _FEWEST = 3  # rounds
@@ -59,7 +77,7 @@ class Row(NamedTuple):
 
     table: str
     name: str
-    figures: Mapping[str, Figure]
+    figures: Mapping[str, Figure]  # none if the row was not asked for
 
 
 Figures = Mapping[str, Figure]
@@ -67,64 +85,71 @@ Figures = Mapping[str, Figure]
 
 @dataclass(frozen=True)
 class Table:
-    """Who is shown, and how: for each heading the best of its contestants, times `scale`.
+    """Who is shown, and how: times `scale`, and as OpenCV the better of its two kinds of maps.
 
-    Headings in `alone` do not compete; None stands for all. A `rate` is shown as so many in a second.
+    Columns in `alone` do not compete; None stands for all. A `rate` is shown as so many in a second.
     """
 
     name: str
     title: str
-    columns: Mapping[str, tuple[str, ...]]
+    columns: tuple[str, ...]
     scale: float = 1e3
     alone: tuple[str, ...] | None = ()
     rate: bool = False
 
     def markdown(self, runs: Sequence[Mapping[str, Figures]], *, spread: bool = False) -> str:
         """Return a table of the rows of runs side by side, and who is the fastest; with `spread` from min to max."""
-        columns = {OURS: (OURS,), WITHOUT_LIBRARY: (WITHOUT_LIBRARY,), **self.columns}
         rows = {name: [run.get(name, {}) for run in runs] for run in runs for name in run}
-        present = {who for row in rows.values() for figures in row for who in figures}
-        headings = [heading for heading, whose in columns.items() if present.intersection(whose)]
+        columns = (OURS, WITHOUT_LIBRARY, *self.columns[1:])
+        headings = [who for who in columns if any(_best(who, figures) for row in rows.values() for figures in row)]
         title = headings if self.alone is None else [*headings, "fastest"]
         lines = [f"| {self.title} | {' | '.join(title)} |", "|---|" + "---:|" * len(title)]
         for name, row in rows.items():
-            cells = [_joined(self._cell(columns[heading], figures, spread) for figures in row) for heading in headings]
+            once = {WITHOUT_LIBRARY: row[-1:]}  # whose runs joined the last
+            cells = [joined(self._cell(who, figures, spread) for figures in once.get(who, row)) for who in headings]
             if self.alone is not None:
-                cells.append(_joined(self.fastest(figures) for figures in row))
+                cells.append(joined(map(self.fastest, row)))
             lines.append(f"| {name} | {' | '.join(cells)} |")
         return "\n".join(lines)
 
-    def fastest(self, figures: Figures) -> str:
-        """Return who is ahead, and of whom: of camtorch, or camtorch of the next."""
-        found = {heading: best for heading, whose in self.columns.items() if (best := _best(whose, figures))}
-        ours = found.pop(OURS, None)
-        peers = {heading: best.median for heading, best in found.items() if heading not in (self.alone or ())}
-        if self.alone is None or ours is None or not peers:
-            return ""
-        ahead = min(peers, key=peers.__getitem__)
-        ratio = peers[ahead] / ours.median
-        return f"camtorch {_times(ratio)}" if ratio >= 1 else f"**{ahead} {_times(1 / ratio)}**"
+    def rival(self, figures: Figures, ours: str = OURS) -> tuple[str, float] | None:
+        """Return the fastest of the others, and how many times the time of camtorch it takes."""
+        if self.alone is None or ours not in figures:
+            return None
+        peers = [who for who in self.columns if who not in (OURS, *self.alone)]
+        found = [(best.median, who) for who in peers if (best := _best(who, figures))]
+        return (min(found)[1], min(found)[0] / figures[ours].median) if found else None
 
-    def _cell(self, whose: Sequence[str], figures: Figures, spread: bool) -> str:
-        if not (best := _best(whose, figures)):
+    def fastest(self, figures: Figures, ours: str = OURS) -> str:
+        """Return who is ahead, and of whom: of camtorch, or camtorch of the next."""
+        if not (found := self.rival(figures, ours)):
+            return ""
+        who, ratio = found
+        return f"camtorch {times(ratio)}" if ratio >= 1 else f"**{who} {times(1 / ratio)}**"
+
+    def _cell(self, who: str, figures: Figures, spread: bool) -> str:
+        if not (best := _best(who, figures)):
             return ""
         shown = [1 / value if self.rate else value * self.scale for value in best if value is not None]
         text, *ends = (digits(value) for value in shown)
         return f"{text} ({ends[-1 if self.rate else 0]}-{ends[0 if self.rate else -1]})" if spread and ends else text
 
 
-def _best(whose: Sequence[str], figures: Figures) -> Figure | None:
-    return min((figures[who] for who in whose if who in figures), default=None, key=lambda figure: figure.median)
+def _best(who: str, figures: Figures) -> Figure | None:
+    those = (who, *OPENCV_MAPS) if who == OPENCV else (who,)
+    return min((figures[one] for one in those if one in figures), default=None)
 
 
-def _times(ratio: float) -> str:
+def times(ratio: float) -> str:
+    """Return a ratio, exact to a percent if it is small."""
     return f"{ratio:.0f}x" if ratio >= 9.95 else f"{ratio:.2f}x" if ratio < 1.045 else f"{ratio:.1f}x"
 
 
-def _joined(cells: Iterable[str]) -> str:
-    """Return the cells of several runs as one, and camtorch once."""
+def joined(cells: Iterable[str]) -> str:
+    """Return the cells of several runs as one, and a name that begins all of them once."""
     one, *more = [cell or "-" for cell in cells]
-    same = [other.removeprefix(f"{OURS} ") if one.startswith(OURS) else other for other in more]
+    name = "" if one.startswith("**") else one.rpartition(" ")[0] + " "
+    same = [other.removeprefix(name) for other in more]
     return " / ".join([one, *same]) if {one, *more} != {"-"} else "-"
 
 
@@ -145,6 +170,7 @@ def measure(table: str, name: str, runs: Mapping[str, Run], options: Options, *,
     """
     calls = {}
     runs = {WITHOUT_LIBRARY: runs[OURS]} if options.no_library else runs
+    runs = runs if re.search(options.rows, name) else {}
     for who, run in runs.items():
         progress(f"{table}: {name}: first call of {who}")
         try:
@@ -163,7 +189,14 @@ def measure(table: str, name: str, runs: Mapping[str, Run], options: Options, *,
                     rounds[who].append(clocked(runs[who], options.device, calls[who]))
     finally:
         gc.enable()
-    return Row(table, name, {who: figure(taken) for who, taken in rounds.items()})
+    return Row(table, name, {who: Figure(statistics.median(r), min(r), max(r)) for who, r in rounds.items()})
+
+
+def step(forward: Callable[..., Tensor], *leaves: Tensor) -> Run:
+    """Return what goes forward and backward, to all leaves; the gradient has the result's layout, as a loss's has."""
+    leaves = tuple(leaf if leaf.requires_grad else leaf.clone().requires_grad_() for leaf in leaves)
+    gradient = torch.ones_like(forward(*leaves))
+    return lambda: torch.autograd.grad(forward(*leaves), leaves, gradient)
 
 
 def clocked(run: Run, device: torch.device | None = None, calls: int = 1) -> float:
@@ -175,11 +208,6 @@ def clocked(run: Run, device: torch.device | None = None, calls: int = 1) -> flo
         run()
     wait()
     return (time.perf_counter() - start) / calls
-
-
-def figure(rounds: list[float]) -> Figure:
-    """Return the median of the rounds and their ends."""
-    return Figure(statistics.median(rounds), min(rounds), max(rounds))
 
 
 @contextmanager
@@ -195,16 +223,11 @@ def threads(count: int) -> Iterator[None]:
         cv2.setNumThreads(before[1])
 
 
-def each_thread_count(most: int) -> Iterator[str]:
-    """Set one thread, then as many as there may be, and name them."""
+def threaded(table: str, name: str, runs: Mapping[str, Run], options: Options, most: int) -> Iterator[Row]:
+    """Measure with one thread, then with as many as there may be."""
     for count in sorted({1, most}):
         with threads(count):
-            yield f"{count} thread{'s' * (count > 1)}"
-
-
-def progress(text: str) -> None:
-    """Write to stderr what is being measured."""
-    print(text, file=sys.stderr, flush=True)
+            yield measure(table, f"{name}, {count} thread{'s' * (count > 1)}", runs, options)
 
 
 def machine(device: torch.device) -> dict[str, str | int]:
@@ -226,10 +249,7 @@ def machine(device: torch.device) -> dict[str, str | int]:
 def _cpu() -> str:
     """Return the processor's name, family and model: a virtual machine may hide the name."""
     listing = Path("/proc/cpuinfo")
-    if not listing.exists():
-        return platform.processor() or platform.machine()
-    pairs = (line.split(":", 1) for line in listing.read_text().splitlines() if ":" in line)
-    facts = {name.strip(): fact.strip() for name, fact in pairs}
-    name = facts.get("model name", platform.machine())
+    facts = dict(re.findall(r"^([\w ]+?)\s*: (.+)", listing.read_text(), re.M)) if listing.exists() else {}
+    name = facts.get("model name", platform.processor() or platform.machine())
     family, model = (facts.get(part, "?") for part in ("cpu family", "model"))
     return f"{name} (family {family}, model {model}; {torch.backends.cpu.get_cpu_capability()})"

@@ -20,24 +20,18 @@ from torch import Tensor
 
 import camtorch as ct
 from benchmarks import cameras
-from benchmarks.harness import KORNIA, NAMES, OURS, Figure, Options, Row, Run, Table, each_thread_count, measure
-
-try:
-    import deltacamera as dc
-except ModuleNotFoundError:
-    dc = None
+from benchmarks.harness import KORNIA, NAMES, OPENCV, OPENCV_MAPS, OURS, Figure, Options, Row, Run, Table, dc, threaded
 
 MODELS = ("kannala_brandt", "brown_conrady")
 SMALL, LARGE, QUICK = (480, 640), (720, 1280), (120, 160)
 KEPT, NEW = "kept maps", "new cameras"
-DELTACAMERA, GRID_SAMPLE = "deltacamera", "`grid_sample` alone"
-OPENCV_MAPS = "OpenCV, float map", "OpenCV, fixed-point map"
-_EVERYONE = {OURS: (OURS,), "OpenCV": OPENCV_MAPS} | {who: (who,) for who in (DELTACAMERA, KORNIA, GRID_SAMPLE)}
+DELTACAMERA, GRID_SAMPLE, TORCH_MAP = "deltacamera", "`grid_sample` alone", "a torch map and `cv2.remap`"
+_EVERYONE = (OURS, OPENCV, TORCH_MAP, DELTACAMERA, KORNIA, GRID_SAMPLE)
 TABLES = (
     Table("kept maps", "kept maps, ms", _EVERYONE),
     Table("new cameras", "new cameras, ms", _EVERYONE),
     Table("images, errors", "largest difference, grey levels", _EVERYONE, 1, None),
-    Table("stereo", "a pair rectified, ms", {OURS: (OURS,), "OpenCV": OPENCV_MAPS}),
+    Table("stereo", "a pair rectified, ms", (OURS, OPENCV)),
 )
 _JUDGED = 2  # images of a batch whose errors are taken
 
@@ -84,15 +78,16 @@ def rows(options: Options) -> Iterator[Row]:
     for key, kind in product(options.chosen(MODELS), asked):
         task = Task(key, *kind, options.device)
         for operation, runs in contestants(task).items():
-            for count in each_thread_count(1 if len(task.images) == 1 else options.threads):
-                yield measure(operation, f"{task.name}, {count}", runs, options)
-            yield Row("images, errors", f"{task.name}, {operation}", _errors(task, operation, runs))
+            yield from threaded(operation, task.name, runs, options, 1 if len(task.images) == 1 else options.threads)
+            if not options.rows:
+                yield Row("images, errors", f"{task.name}, {operation}", _errors(task, operation, runs))
     with torch.no_grad():
         for key, channels in product(options.chosen(MODELS), (1, 3)):
             yield from _pair(key, channels, options)
 
 
 def _errors(task: Task, operation: str, runs: dict[str, Run]) -> dict[str, Figure]:
+    """The largest error of each contestant, over pixels none of whose neighbours lies off the image."""
     images, double = task.images[:_JUDGED], torch.float64
     if operation == KEPT:
         target = task.dewarp.target
@@ -100,28 +95,20 @@ def _errors(task: Task, operation: str, runs: dict[str, Run]) -> dict[str, Figur
         warp = ct.Warp(task.camera(dtype=double), straight)
     else:
         warp = task.warp_of(task.camera(len(images), double))
-    truth, inside = true_images(images, warp)
-    results = {who: as_tensor(run())[:_JUDGED] for who, run in runs.items()}
-    return {who: Figure((result - truth).abs()[inside].max().item()) for who, result in results.items()}
-
-
-def true_images(images: Tensor, warp: ct.Warp) -> tuple[Tensor, Tensor]:
-    """Return (B, C, H, W) in float64, and where no neighbour lies off the image, from the cameras of `warp`."""
     with torch.no_grad():
         rays, has_ray = warp.target.rays()
-        pixels, mapped = warp.source.project(rays @ warp.rotation if warp.rotation is not None else rays)
+        pixels, mapped = warp.source.project(rays)
         last = pixels.new_tensor([warp.source.width - 1, warp.source.height - 1])
         inside = ((pixels > 0) & (pixels < last)).all(-1) & has_ray & mapped
         grid = 2 * pixels / last - 1
         truth = F.grid_sample(images.double(), grid.expand(len(images), *grid.shape[-3:]), align_corners=True)
-    return truth, inside.expand(len(images), *inside.shape[-2:]).unsqueeze(1).expand_as(truth)
-
-
-def as_tensor(result: object) -> Tensor:
-    """Return (B, C, H, W) of what a contestant gave."""
-    if isinstance(result, Tensor):
-        return result
-    return torch.stack([torch.from_numpy(array).reshape(*array.shape[:2], -1).permute(2, 0, 1) for array in result])
+    inside = inside.expand(len(images), *inside.shape[-2:]).unsqueeze(1).expand_as(truth)
+    found = {who: run() for who, run in runs.items()}
+    for who, result in found.items():
+        if not isinstance(result, Tensor):
+            arrays = [torch.from_numpy(array).reshape(*array.shape[:2], -1) for array in result]
+            found[who] = torch.stack(arrays).permute(0, 3, 1, 2).to(truth)
+    return {who: Figure((result[:_JUDGED] - truth).abs()[inside].max().item()) for who, result in found.items()}
 
 
 def contestants(task: Task) -> dict[str, dict[str, Run]]:
@@ -140,6 +127,8 @@ def contestants(task: Task) -> dict[str, dict[str, Run]]:
         makers = [opencv_maps(*pair, np.eye(3), kind) for pair in pairs]
         found[KEPT][name] = partial(_remap, arrays, [lambda kept=kept: kept] * len(arrays))
         found[NEW][name] = partial(_remap, arrays, makers)
+    makers = [partial(_torch_map, *pair) for pair in pairs]
+    found[NEW][TORCH_MAP] = partial(_remap, arrays, makers)
     if dc is not None:
         lenses = [tuple(map(_deltacamera, pair)) for pair in [(dewarp.source, dewarp.target), *pairs]]
         # its best case: the map, or for new cameras what it keeps of each lens, is in its cache
@@ -155,6 +144,27 @@ def contestants(task: Task) -> dict[str, dict[str, Run]]:
 
 def _remap(arrays: list[np.ndarray], makers: list[Callable[[], tuple[np.ndarray, np.ndarray]]]) -> list[np.ndarray]:
     return [cv2.remap(array, *make(), cv2.INTER_LINEAR) for array, make in zip(arrays, makers, strict=True)]
+
+
+def _torch_map(source: ct.Camera, target: ct.Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the maps of `cv2.remap` by the formula of a lens in torch, as a user writes it who knows the lens."""
+    fx, fy, cx, cy = target.intrinsics.tolist()
+    (height, width), (k1, k2, *more) = target.image_size, source.distortion.tolist()
+    x, y = (torch.arange(width) - cx) / fx, (torch.arange(height)[:, None] - cy) / fy
+    square = x * x + y * y
+    if isinstance(source, ct.KannalaBrandt):
+        radius, (k3, k4) = square.sqrt(), more
+        angle = radius.atan()
+        square = angle * angle
+        scale = angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))) / radius
+        x, y = x * scale, y * scale
+    else:
+        twice, (p1, p2, k3) = 2 * x * y, more
+        scale = 1 + square * (k1 + square * (k2 + square * k3))
+        u = x * scale + p1 * twice + p2 * (square + 2 * x * x)
+        x, y = u, y * scale + p2 * twice + p1 * (square + 2 * y * y)
+    fx, fy, cx, cy = source.intrinsics.tolist()
+    return (x * fx + cx).numpy(), (y * fy + cy).numpy()
 
 
 def opencv_maps(
@@ -189,5 +199,5 @@ def _pair(key: str, channels: int, options: Options) -> Iterator[Row]:
     for name, kind in zip(OPENCV_MAPS, (cv2.CV_32FC1, cv2.CV_16SC2), strict=True):
         maps = [opencv_maps(camera, ours.camera_left, turn, kind)() for turn in turns]
         runs[name] = partial(_remap, arrays, [lambda pair=pair: pair for pair in maps])
-    for count in each_thread_count(options.threads):
-        yield measure("stereo", f"{NAMES[key]}, {channels}x{size[0]}x{size[1]} uint8, {count}", runs, options)
+    name = "{}, {}x{}x{} uint8".format(NAMES[key], channels, *size)
+    yield from threaded("stereo", name, runs, options, options.threads)

@@ -7,6 +7,7 @@ ray is projected in float64, and compared with the pixel that went in.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -18,14 +19,14 @@ from torch import Tensor
 
 import camtorch as ct
 from benchmarks import cameras
-from benchmarks.harness import KORNIA, NAMES, OPENCV, OURS, Figure, Options, Row, Run, Table, measure, threads
+from benchmarks.harness import KORNIA, NAMES, OPENCV, OURS, Figure, Options, Row, Table, measure, step, threads
 from benchmarks.memory import kept_for_backward
 
 COMPILED, FORMULA = "compiled", "its formula in torch"
-_EVERYONE = {who: (who,) for who in (OURS, COMPILED, OPENCV, KORNIA)}
+_EVERYONE = (OURS, COMPILED, OPENCV, KORNIA)
 TABLES = (
     Table("points", "1M float32 points, ms", _EVERYONE, alone=(COMPILED,)),
-    Table("few points", "100 float32 points, us", {OURS: (OURS,), FORMULA: (FORMULA,)}, 1e6),
+    Table("few points", "100 float32 points, us", (OURS, FORMULA), 1e6),
     Table("points, memory", "bytes a point that wait for the backward pass, input included", _EVERYONE, 1, None),
     Table("points, errors", "largest error, px, where there is an answer", _EVERYONE, 1, None),
     Table("points, lost", "% without an answer, or off by more than 1 px", _EVERYONE, 100, None),
@@ -34,6 +35,8 @@ _WITHIN_90 = ("pinhole", "brown_conrady")
 _OFF = 1.0  # pixels: an answer further off is wrong
 _COMPILED = ("kannala_brandt", "brown_conrady", "fisheye624")  # unless asked for models: each takes half a minute
 _MOST_JUDGED = 250_000  # points whose errors are taken
+_ahead = lambda points: points[:, :2] / points[:, 2:]
+_on_plane = lambda pixels: torch.nn.functional.pad(pixels, (0, 1), value=1.0)
 
 
 @dataclass(frozen=True)
@@ -63,12 +66,13 @@ def rows(options: Options) -> Iterator[Row]:
     for key in options.chosen(tuple(cameras.COEFFICIENTS)):
         torch.compiler.reset()  # what was compiled for another model
         compiled = options.compile and (key in _COMPILED or key in options.model)
-        reference = cameras.camera(key, options.device, torch.float64)
+        reference = cameras.camera(key, options.device, torch.float64).requires_grad_(False)
         points = cameras.points(options.size, 75, options.device)
-        for way, source in (("project", points), ("unproject", _pixels(reference, points))):
+        pixels = reference.project(points.double())[0].float().contiguous()
+        for way, source in (("project", points), ("unproject", pixels)):
             everyone = contestants(key, way, options.device, compiled=compiled)
             yield from _way(f"{NAMES.get(key, key)} {way}", everyone, source, options)
-            for degrees in (45, 75) if key in _WITHIN_90 else (75, 100):
+            for degrees in () if options.rows else (45, 75) if key in _WITHIN_90 else (75, 100):
                 yield from _errors(f"{NAMES.get(key, key)} {way}", way, everyone, reference, degrees, options)
     if few := options.chosen(("kannala_brandt",)):
         lens, points = cameras.camera(*few, options.device), cameras.points(100, 90, options.device)
@@ -95,10 +99,8 @@ def contestants(key: str, way: str, device: torch.device, *, compiled: bool) -> 
     found = {OURS: Direction(call, answer=masked, learns=learns)}
     if compiled:
         found[COMPILED] = Direction(torch.compile(call, dynamic=False), answer=masked, learns=learns)
-    peers = {"kannala_brandt": _fisheye_peers, "brown_conrady": _perspective_peers}.get(key)
-    if peers is not None:
-        found |= {who: both[way == "unproject"] for who, both in peers(cameras.COEFFICIENTS[key], device).items()}
-    return found
+    peers = {"kannala_brandt": _fisheye_peers, "brown_conrady": _perspective_peers}.get(key, lambda *_: {})
+    return found | {who: both[way == "unproject"] for who, both in peers(cameras.COEFFICIENTS[key], device).items()}
 
 
 def _fisheye_peers(lens: tuple[float, ...], device: torch.device) -> dict[str, tuple[Direction, Direction]]:
@@ -142,51 +144,17 @@ def _opencv(module: Any, lens: tuple[float, ...]) -> tuple[Direction, Direction]
     )
 
 
-def _ahead(points: Tensor) -> Tensor:
-    return points[:, :2] / points[:, 2:]
-
-
-def _on_plane(pixels: Tensor) -> Tensor:
-    return torch.nn.functional.pad(pixels, (0, 1), value=1.0)
-
-
-def _pixels(reference: ct.Camera, points: Tensor) -> Tensor:
-    with torch.no_grad():
-        return reference.project(points.double())[0].float().contiguous()
-
-
 def _way(name: str, everyone: Contestants, source: Tensor, options: Options) -> Iterator[Row]:
     """Forward, and forward with backward."""
     inputs = {who: direction.prepare(source) for who, direction in everyone.items()}
-    forward = {who: _inference(direction, inputs[who]) for who, direction in everyone.items()}
-    both = {who: _learning(d, inputs[who]) for who, d in everyone.items() if d.learns is not None}
+    forward = {who: partial(torch.no_grad()(d.call), inputs[who]) for who, d in everyone.items()}
+    learning = {who: d for who, d in everyone.items() if d.learns is not None}
+    both = {who: step(lambda x, *_, d=d: d.values(x), inputs[who], *d.learns) for who, d in learning.items()}
     for text, runs in ((name, forward), (f"{name} and backward", both)):
         found, million = measure("points", text, runs, options).figures, 1e6 / len(source)
         yield Row("points", text, {who: figure.times(million) for who, figure in found.items()})
     kept = {who: kept_for_backward(everyone[who].values, inputs[who]) / len(source) for who in both if who in found}
     yield Row("points, memory", name, {who: Figure(value) for who, value in kept.items()})
-
-
-def _inference(direction: Direction, source: Any) -> Run:
-    def run():
-        with torch.no_grad():
-            return direction.call(source)
-
-    return run
-
-
-def _learning(direction: Direction, source: Tensor) -> Run:
-    """Forward and backward, to the input and all parameters; the gradient has the result's layout, as a loss's has."""
-    gradient = None
-
-    def run():
-        nonlocal gradient
-        leaf = source.detach().requires_grad_()
-        values = direction.values(leaf)
-        gradient = torch.ones_like(values) if gradient is None else gradient
-        return torch.autograd.grad(values, (leaf, *direction.learns), gradient)
-
-    return run
 
 
 def _errors(

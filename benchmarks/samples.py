@@ -16,36 +16,27 @@ from itertools import product
 import cv2
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, default_collate
 
 import camtorch.augment.numpy
 from benchmarks import augment, cameras
-from benchmarks.augment import torchvision
-from benchmarks.harness import NAMES, OPENCV, OURS, Options, Row, Run, Table, measure, threads
+from benchmarks.harness import OPENCV, OURS, A, Options, Row, Run, Table, kornia_rs, measure, threads, tv, v2
 from camtorch.augment import RandomCamera, RandomLens, RandomMount, collate
-
-try:
-    import albumentations as A  # noqa: N812 (its own name)
-except ModuleNotFoundError:
-    A = None
-try:
-    import kornia_rs
-except ModuleNotFoundError:
-    kornia_rs = None
 
 ALBUMENTATIONS, TORCHVISION, NOTHING = "albumentations", "torchvision", "nothing done"
 BARE_OPENCV, BARE_KORNIA = "OpenCV, image alone", "kornia-rs, image alone"
 SIZES = (256, 256), (480, 640)
-_EVERYONE = (OURS, ALBUMENTATIONS, TORCHVISION, OPENCV, BARE_OPENCV, BARE_KORNIA)
-_LOADERS = {who: (who,) for who in (OURS, OPENCV, ALBUMENTATIONS, NOTHING)}
 TABLES = (
-    Table("samples", "one image, us", {who: (who,) for who in _EVERYONE}, 1e6),
-    Table("loader", "samples a second", _LOADERS, alone=(NOTHING,), rate=True),
+    Table("samples", "one image, us", (OURS, ALBUMENTATIONS, TORCHVISION, OPENCV, BARE_OPENCV, BARE_KORNIA), 1e6),
+    Table("loader", "samples a second", (OURS, OPENCV, ALBUMENTATIONS, NOTHING), alone=(NOTHING,), rate=True),
 )
 _ANGLES = {"yaw": 10, "pitch": 10, "roll": 10}
 _SHORTEST = 0.02  # seconds that one round of a contestant takes
 _BATCHES, _QUICK_BATCHES = 24, 2  # of an epoch
-_COLLATES = {"": None, ", ct.augment.collate": collate}
+_PLAIN, _MASKED = ("image", "keypoints"), ("image", "mask", "keypoints")
+_KNOWN = (*_MASKED, "bboxes")  # to albumentations and to torchvision
+MOUNT, DRIVER, LENS, FISHEYE = "RandomMount", "RandomMount of a driver", "RandomLens", "RandomLens to a fisheye"
+CAMERAS = {f"RandomCamera, {case.name}": case for case in augment.CASES[:2]}
 
 Sample = dict[str, np.ndarray]
 Move = Callable[[Sample], Sample]
@@ -54,18 +45,20 @@ Move = Callable[[Sample], Sample]
 def rows(options: Options) -> Iterator[Row]:
     """Measure each change on both sizes, then the loaders."""
     if options.device.type == "cpu":
-        with threads(1):
-            for size in SIZES[:1] if options.quick else SIZES:
-                for case, runs in _contestants(size).items():
-                    yield measure("samples", "{}, {}x{}x3".format(case, *size), runs, options, shortest=_SHORTEST)
+        for size, case in product(SIZES[:1] if options.quick else SIZES, (MOUNT, DRIVER, LENS, FISHEYE, *CAMERAS)):
+            sample, name = _sample(case, size), "{}, {}x{}x3".format(case, *size)
+            runs = {who: partial(move, sample) for who, move in _moves(case, size).items()}
+            runs |= _others(sample) if case in (MOUNT, DRIVER) else {}
+            with threads(1):
+                yield measure("samples", name, runs, options, shortest=_SHORTEST)
         yield from _loaders(options)
 
 
-def _driver(size: tuple[int, int], index: int = 0) -> Sample:
-    """Return a sample with every label."""
+def _sample(case: str, size: tuple[int, int], index: int = 0) -> Sample:
+    """Return a sample with the fields of a case: a driver's has every label."""
     random = np.random.default_rng(index)
     height, width = size
-    return {
+    driver = {
         "image": random.integers(256, size=(*size, 3), dtype=np.uint8),
         "mask": random.integers(2, size=size, dtype=np.uint8),
         "keypoints": (random.random((augment.LANDMARKS, 2)) * size[::-1]).astype(np.float32),
@@ -73,147 +66,89 @@ def _driver(size: tuple[int, int], index: int = 0) -> Sample:
         "gaze": np.array([0.1, 0.2, -1.0], np.float32),
         "head_pose": np.array([[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0.6], [0, 0, 0, 1]], np.float32),
     }
+    return driver if case == DRIVER else {name: driver[name] for name in (_MASKED if case in CAMERAS else _PLAIN)}
 
 
-def _contestants(size: tuple[int, int]) -> dict[str, dict[str, Run]]:
-    """Case -> name -> what is timed."""
-    driver, cpu = _driver(size), torch.device("cpu")
-    masked, plain = ({name: driver[name] for name in names} for names in (_MASKED, _PLAIN))
-    keys = ("brown_conrady", "kannala_brandt")
-    brown, fisheye = (cameras.camera(key, cpu, size=size).requires_grad_(False) for key in keys)
-
-    def ours(change: Callable, sample: Sample) -> Run:
-        transform = camtorch.augment.numpy.Transform(change)
-        return lambda: transform(**sample)
-
-    mount, lens = RandomMount(camera=brown, min_filled=0, **_ANGLES), RandomLens(camera=brown)
-    to_fisheye = RandomLens("kannala_brandt", camera=brown, fov=(60, 70), min_filled=0)
-    found: dict[str, dict[str, Run]] = {
-        "RandomMount": {OURS: ours(mount, plain), **_bare(driver["image"])},
-        "RandomMount of a driver": {OURS: ours(mount, driver)},
-        "RandomLens": {OURS: ours(lens, plain)},
-        "RandomLens to a fisheye": {OURS: ours(to_fisheye, plain)},
-    }
-    for case, sample in (("RandomMount", plain), ("RandomMount of a driver", driver)):
-        if A is not None:
-            found[case][ALBUMENTATIONS] = partial(albumentations_affine(sample), **_known(sample))
-        if torchvision is not None:
-            found[case][TORCHVISION] = _torchvision_affine(sample)
+def _moves(case: str, size: tuple[int, int]) -> dict[str, Move]:
+    """Name -> how a sample is moved."""
+    of_opencv = CAMERAS.get(case)
+    key = of_opencv.source if of_opencv else "brown_conrady"
+    camera = cameras.camera(key, torch.device("cpu"), size=size).requires_grad_(False)
+    if of_opencv:
+        change = RandomCamera(of_opencv.like, camera=camera, fov=of_opencv.fov, **augment.ANGLES)
+    elif case in (MOUNT, DRIVER):
+        change = RandomMount(camera=camera, min_filled=0, **_ANGLES)
+    else:
+        to_fisheye = {"like": "kannala_brandt", "fov": (60, 70), "min_filled": 0}
+        change = RandomLens(camera=camera, **(to_fisheye if case == FISHEYE else {}))
+    found: dict[str, Move] = {OURS: partial(_fields, camtorch.augment.numpy.Transform(change), None)}
+    if of_opencv:
+        found[OPENCV] = partial(_opencv, augment.opencv_camera(of_opencv, camera))
     if A is not None:
+        affine = A.Affine(rotate=(-10, 10), translate_percent=(-0.02, 0.02), scale=(0.95, 1.05), p=1)
+        boxes = A.BboxParams("pascal_voc") if case == DRIVER else None
+        affine = A.Compose([affine], bbox_params=boxes, keypoint_params=A.KeypointParams("xy", remove_invisible=False))
         distortion = A.Compose([A.OpticalDistortion(distort_limit=0.3, p=1)])
-        for case in ("RandomLens", "RandomLens to a fisheye"):
-            found[case][ALBUMENTATIONS] = partial(distortion, image=driver["image"])
-    for case, camera in zip(augment.CASES[:2], (brown, fisheye), strict=True):
-        change = RandomCamera(case.like, camera=camera, fov=case.fov, **augment.ANGLES)
-        by_hand = partial(augment.opencv_camera(case, camera), *masked.values())
-        found[f"RandomCamera, {NAMES[case.source]} to {case.like}"] = {OURS: ours(change, masked), OPENCV: by_hand}
+        theirs = (distortion, ("image",)) if case in (LENS, FISHEYE) else (affine, _KNOWN)
+        found[ALBUMENTATIONS] = partial(_fields, *theirs)
     return found
 
 
-_PLAIN, _MASKED = ("image", "keypoints"), ("image", "mask", "keypoints")
-_KNOWN = (*_MASKED, "bboxes")  # to albumentations and to torchvision
+def _fields(transform: Callable[..., Sample], known: tuple[str, ...] | None, sample: Sample) -> Sample:
+    """Return the fields that came in; those that a transform does not know stay."""
+    moved = transform(**{name: value for name, value in sample.items() if known is None or name in known})
+    return {name: moved.get(name, value) for name, value in sample.items()}
 
 
-def _known(sample: Sample) -> Sample:
-    return {name: value for name, value in sample.items() if name in _KNOWN}
+def _opencv(move: Callable, sample: Sample) -> Sample:
+    return dict(zip(sample, move(*sample.values()), strict=True))
 
 
-def albumentations_affine(sample: Sample) -> Callable[..., dict]:
-    """Return its affine map of about the same extent."""
-    affine = A.Affine(rotate=(-10, 10), translate_percent=(-0.02, 0.02), scale=(0.95, 1.05), p=1)
-    boxes = A.BboxParams("pascal_voc") if "bboxes" in sample else None
-    return A.Compose([affine], bbox_params=boxes, keypoint_params=A.KeypointParams("xy", remove_invisible=False))
-
-
-def _torchvision_affine(sample: Sample) -> Run:
-    """The same by torchvision, whose tensors are there before the clock starts."""
-    v2, tv, size = torchvision.transforms.v2, torchvision.tv_tensors, sample["image"].shape[:2]
-    kinds = {
-        "image": lambda image: tv.Image(image.permute(2, 0, 1).contiguous()),
-        "mask": tv.Mask,
-        "keypoints": partial(tv.KeyPoints, canvas_size=size),
-        "bboxes": partial(tv.BoundingBoxes, format="XYXY", canvas_size=size),
-    }
-    given = {name: kinds[name](torch.from_numpy(value)) for name, value in _known(sample).items()}
-    bilinear = v2.InterpolationMode.BILINEAR
-    affine = v2.RandomAffine(10, translate=(0.02, 0.02), scale=(0.95, 1.05), interpolation=bilinear)
-    return lambda: affine(given)
-
-
-def _bare(image: np.ndarray) -> dict[str, Run]:
-    """An affine warp of the image alone."""
-    height, width = image.shape[:2]
+def _others(sample: Sample) -> dict[str, Run]:
+    """The same by torchvision, whose tensors are there before the clock starts; an affine warp of the image alone."""
+    image, (height, width) = sample["image"], sample["image"].shape[:2]
     matrix = cv2.getRotationMatrix2D((width / 2, height / 2), 7, 1.02)
-    found: dict[str, Run] = {BARE_OPENCV: lambda: cv2.warpAffine(image, matrix, (width, height))}
-    if kornia_rs is not None:
+    found: dict[str, Run] = {}
+    if "bboxes" not in sample:
+        found[BARE_OPENCV] = lambda: cv2.warpAffine(image, matrix, (width, height))
         numbers = tuple(matrix.ravel().tolist())
-        found[BARE_KORNIA] = lambda: kornia_rs.imgproc.warp_affine(image, numbers, (height, width), "bilinear")
+        if kornia_rs is not None:
+            found[BARE_KORNIA] = lambda: kornia_rs.imgproc.warp_affine(image, numbers, (height, width), "bilinear")
+    if v2 is not None:
+        kinds = {
+            "image": lambda image: tv.Image(image.permute(2, 0, 1).contiguous()),
+            "mask": tv.Mask,
+            "keypoints": partial(tv.KeyPoints, canvas_size=(height, width)),
+            "bboxes": partial(tv.BoundingBoxes, format="XYXY", canvas_size=(height, width)),
+        }
+        given = {name: kinds[name](torch.from_numpy(sample[name])) for name in _KNOWN if name in sample}
+        bilinear = v2.InterpolationMode.BILINEAR
+        affine = v2.RandomAffine(10, translate=(0.02, 0.02), scale=(0.95, 1.05), interpolation=bilinear)
+        found[TORCHVISION] = lambda: affine(given)
     return found
-
-
-class Samples(Dataset):
-    """The same few samples again and again, each augmented anew."""
-
-    def __init__(self, move: Move, samples: list[Sample], count: int):
-        self.move, self.samples, self.count = move, samples, count
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, index: int) -> Sample:
-        """Return one of the samples, augmented."""
-        return self.move(self.samples[index % len(self.samples)])
 
 
 def _loaders(options: Options) -> Iterator[Row]:
     """Epochs with two workers: drivers, then lenses; all collated as torch does, then all by `ct.augment.collate`."""
     count = augment.BATCH * (_QUICK_BATCHES if options.quick or options.no_library else _BATCHES)
-    for case, (how, by) in product((None, *augment.CASES[:2]), _COLLATES.items()):
-        size = augment.QUICK_SIZE if options.quick else augment.SIZE if case else SIZES[0]
-        drivers = [_driver(size, index) for index in range(augment.BATCH)]
-        samples = [{name: driver[name] for name in (_MASKED if case else driver)} for driver in drivers]
-        moves = _moves(case, size, samples[0])
-        runs = {who: _epochs(Samples(move, samples, count), by) for who, move in moves.items()}
+    for case, by in product((DRIVER, *CAMERAS), (default_collate, collate)):
+        size = augment.QUICK_SIZE if options.quick else augment.SIZE if case in CAMERAS else SIZES[0]
+        samples = [_sample(case, size, index) for index in range(augment.BATCH)] * (count // augment.BATCH)
+        runs = {who: _epochs(samples, move, by) for who, move in {**_moves(case, size), NOTHING: dict}.items()}
         # OpenCV as torch does by itself: one in a worker. Its threads do not come along with a fork, so before that
         with threads(1):
-            name = f"{f'RandomCamera, {case.name}' if case else 'RandomMount of a driver'}, {size[0]}x{size[1]}x3{how}"
+            name = "{}, {}x{}x3{}".format(case, *size, ", ct.augment.collate" * (by is collate))
             found = measure("loader", name, runs, options)
         yield found._replace(figures={who: figure.times(1 / count) for who, figure in found.figures.items()})
 
 
-def _epochs(samples: Samples, collate_fn: Callable | None) -> Run:
-    """An epoch of a loader whose workers stay."""
-    how = {"batch_size": augment.BATCH, "num_workers": 2, "persistent_workers": True, "collate_fn": collate_fn}
-    loader = DataLoader(samples, **how)
+def _epochs(samples: list[Sample], move: Move, by: Callable[[list[Sample]], object]) -> Run:
+    """An epoch of a loader whose workers stay, move each sample anew, and collate."""
+    how = {"batch_size": augment.BATCH, "num_workers": 2, "persistent_workers": True, "multiprocessing_context": "fork"}
+    loader = DataLoader(samples, collate_fn=lambda batch: by([move(sample) for sample in batch]), **how)
 
     def run() -> None:
         for _ in loader:
             pass
 
     return run
-
-
-def _moves(case: augment.Case | None, size: tuple[int, int], sample: Sample) -> dict[str, Move]:
-    """Name -> how a sample is augmented."""
-    key = case.source if case else "brown_conrady"
-    camera = cameras.camera(key, torch.device("cpu"), size=size).requires_grad_(False)
-    if case:
-        change = RandomCamera(case.like, camera=camera, fov=case.fov, **augment.ANGLES)
-        found = {OPENCV: partial(_opencv, augment.opencv_camera(case, camera))}
-    else:
-        change, found = RandomMount(camera=camera, min_filled=0, **_ANGLES), {}
-    found[OURS] = partial(_fields, camtorch.augment.numpy.Transform(change))
-    if A is not None:
-        found[ALBUMENTATIONS] = partial(_fields, albumentations_affine(sample))
-    return {**found, NOTHING: dict}
-
-
-def _fields(transform: Callable[..., Sample], sample: Sample) -> Sample:
-    """Return the fields that came in; what a transform does not know stays."""
-    is_ours = isinstance(transform, camtorch.augment.numpy.Transform)
-    moved = transform(**(sample if is_ours else _known(sample)))
-    return {name: moved.get(name, value) for name, value in sample.items()}
-
-
-def _opencv(move: Callable, sample: Sample) -> Sample:
-    return dict(zip(sample, move(*sample.values()), strict=True))

@@ -1,11 +1,11 @@
 """The training path: a warp forward and backward, to the images, and to the images and the cameras of a batch.
 
 kornia's `undistort_image` computes its map each time; the lens that it does not know goes through its formula and its
-`remap`. Without cameras that learn, its map is kept, as camtorch's is. `grid_sample` alone has no camera: its gradients
-are those of images and positions.
+`remap`. Without cameras that learn, its map is kept, as camtorch's is. `grid_sample` alone has no camera: its
+positions are given, and learn where cameras do.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 
 import torch
@@ -13,13 +13,13 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from kornia.geometry.calibration import undistort_image
 from kornia.geometry.camera.distortion_kannala_brandt import distort_points_kannala_brandt
 from kornia.geometry.transform import remap
-from torch import Tensor
 
 import camtorch as ct
-from benchmarks.harness import KORNIA, OURS, Options, Row, Run, Table, each_thread_count, measure
+from benchmarks.harness import KORNIA, OURS, Options, Row, Run, Table, step, threaded
 from benchmarks.images import GRID_SAMPLE, MODELS, QUICK, SMALL, Task
 
-TABLES = (Table("training", "forward and backward, ms", {who: (who,) for who in (OURS, KORNIA, GRID_SAMPLE)}),)
+GRID_LEARNS = "`grid_sample`, its grid learns"
+TABLES = (Table("training", "forward and backward, ms", (OURS, KORNIA, GRID_SAMPLE, GRID_LEARNS)),)
 
 
 def rows(options: Options) -> Iterator[Row]:
@@ -28,8 +28,7 @@ def rows(options: Options) -> Iterator[Row]:
         shape = (3, *(QUICK if options.quick else SMALL))
         task = Task(key, 8, shape, torch.float32, options.device)
         for case, runs in _contestants(task).items():
-            for count in each_thread_count(options.threads):
-                yield measure("training", f"{task.name}, to {case}, {count}", runs, options)
+            yield from threaded("training", f"{task.name}, to {case}", runs, options, options.threads)
 
 
 def _contestants(task: Task) -> dict[str, dict[str, Run]]:
@@ -49,20 +48,13 @@ def _contestants(task: Task) -> dict[str, dict[str, Run]]:
     }[task.key]
     return {
         "images": {
-            OURS: _step(task.new, images),
-            KORNIA: _step(lambda x: move(x, *pixels.unbind(-1)), images),
-            GRID_SAMPLE: _step(lambda x: sample(x, grid), images),
+            OURS: step(task.new, images),
+            KORNIA: step(lambda x: move(x, *pixels.unbind(-1)), images),
+            GRID_SAMPLE: step(lambda x: sample(x, grid), images),
         },
         "images and cameras": {
-            OURS: _step(lambda x, *_: learning(x), images, *parameters),
-            KORNIA: _step(by_kornia, images, *parameters),
-            GRID_SAMPLE: _step(sample, images, grid),
+            OURS: step(lambda x, *_: learning(x), images, *parameters),
+            KORNIA: step(by_kornia, images, *parameters),
+            GRID_LEARNS: step(sample, images, grid),
         },
     }
-
-
-def _step(forward: Callable[..., Tensor], *leaves: Tensor) -> Run:
-    """Forward and backward, to all leaves."""
-    leaves = tuple(leaf if leaf.requires_grad else leaf.clone().requires_grad_() for leaf in leaves)
-    gradient = torch.ones_like(forward(*leaves))
-    return lambda: torch.autograd.grad(forward(*leaves), leaves, gradient)
