@@ -4,13 +4,15 @@
 prints a table of launches, waits for a value (syncs) and copies. The module has `CASES`, name -> function(device) that
 returns tensors, in lists, tuples, dicts, objects and modules, or a function: then its calls alone are counted. It may
 have `BOUNDS`, name -> the most launches, syncs and copies. The device changes torch for the whole process, so tests
-start one: `try_cases`.
+start one: `try_cases`. With `CAMTORCH_DEVICE=cuda` the cases are tried on a real device instead, where nothing is
+counted.
 """
 
 import collections
 import functools
 import importlib
 import inspect
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -19,7 +21,7 @@ import torch
 from torch import nn
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
-NAME = "pretended"
+NAME, DEVICE = "pretended", os.environ.get("CAMTORCH_DEVICE", "pretended")
 COUNTS = collections.Counter()
 TOLERANCE = {torch.bool: 0, torch.float64: 1e-7, torch.float32: 1e-3}
 """Or 1e-7 of a tensor's largest number, if that is more. Whole numbers, as grey levels, may differ by 1."""
@@ -142,7 +144,7 @@ def tried(name, case, limits):
     """Print a row of the table; return whether a result differs from the CPU's, or lies there, or a limit is passed."""
     results = []
     try:
-        for device in ("cpu", NAME):
+        for device in ("cpu", DEVICE):
             torch.manual_seed(0)
             COUNTS.clear()
             result = case(device)
@@ -155,10 +157,11 @@ def tried(name, case, limits):
         assert all(map(int.__le__, counts, limits or counts)), f"more than {limits}"
         assert len(results[0]) == len(results[1]) > 0, "another number of tensors"
         for i, (there, here) in enumerate(zip(*results, strict=True)):
-            assert here.device.type == NAME, f"tensor {i} {tuple(here.shape)} lies on {here.device}"
+            assert here.device.type == DEVICE, f"tensor {i} {tuple(here.shape)} lies on {here.device}"
             large = there.detach().double().nan_to_num(0, 0, 0).abs().amax().item() if there.numel() else 0
             close = {"rtol": 0, "atol": max(TOLERANCE.get(there.dtype, 1), 1e-7 * large), "equal_nan": True}
-            torch.testing.assert_close(here.on_host, there, msg=lambda text, i=i: f"tensor {i}: {text}", **close)
+            found = here.on_host if DEVICE == NAME else here.cpu()
+            torch.testing.assert_close(found, there, msg=lambda text, i=i: f"tensor {i}: {text}", **close)
     except Exception as error:
         print(f"FAILED  {name}: {type(error).__name__}: {error}")
         return True
@@ -175,7 +178,8 @@ def try_cases(module):
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parent / "devices"))
     torch.set_num_threads(1)
-    installed, table = install(), importlib.import_module(sys.argv[1])
+    installed = install() if DEVICE == NAME else None
+    table = importlib.import_module(sys.argv[1])
     print("launches  syncs  copies")
     names = sys.argv[2:] or table.CASES
     sys.exit(sum(tried(name, table.CASES[name], getattr(table, "BOUNDS", {}).get(name)) for name in names) > 0)
