@@ -310,8 +310,9 @@ class Mixed(Camera):
 def cat(cameras: Iterable[Camera], *_more: object) -> Camera:
     """Concatenate cameras to one batch, as `torch.cat` does tensors; a single camera is one row.
 
-    Cameras of one model and number of coefficients become a batch of that model, others a `Mixed`. Fixed numbers stay
-    fixed, and gradients go to every camera that learns.
+    `torch.cat` of cameras, `torch.stack` of single ones and torch's `default_collate` give the same. Cameras of one
+    model and number of coefficients become a batch of that model, others a `Mixed`. Fixed numbers stay fixed, and
+    gradients go to every camera that learns.
 
     Args:
         cameras: single cameras, batches of one dim, and `Mixed` ones, whose images are of one size.
@@ -407,5 +408,25 @@ def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> C
     return list(batch) if any(camera.batch_shape for camera in batch) else cat(batch)
 
 
+def _joined(cls: type[Camera], function: Any, _: Any, given: Any = (), options: Any = None) -> Camera:
+    """Return the result of `torch.stack` and `torch.cat` of cameras, that of `cat`; raise for other functions."""
+    options = dict(options or {})
+    cameras = given[0] if given else options.pop("tensors", None)
+    if function not in (torch.stack, torch.cat, torch.concat, torch.concatenate):
+        name = getattr(function, "__name__", function)
+        raise TypeError(
+            f"{cls.__name__}: a function of cameras must be torch.stack or torch.cat; got {name}. Pass a tensor, like "
+            "camera.intrinsics or camera.K"
+        )
+    if other := {*given[1:], *options.values()} - {0, -1, None}:
+        raise ValueError(f"{cls.__name__}: cameras must be joined along dim 0, without out; got {shown(other.pop())}")
+    for i, camera in enumerate(cameras if function is torch.stack else ()):
+        if isinstance(camera, Camera) and (shape := tuple(camera.batch_shape)):
+            joined = "torch.cat joins batches"
+            raise ValueError(f"stack: cameras[{i}] must be single; got batch dims {shape}. {joined}")
+    return cat(cameras)
+
+
 # Samples that hold cameras then go through a DataLoader as they are. torch documents this map for the purpose.
 COLLATE_FUNCTIONS[Camera] = collate_cameras
+Camera.__torch_function__ = classmethod(_joined)  # type: ignore[attr-defined]

@@ -171,6 +171,7 @@ MADE = {
     "expand": lambda camera: camera.expand(2),
     "index": lambda camera: camera.expand(3)[1],
     "cat": lambda camera: ct.cat([camera, camera]),
+    "torch.cat": lambda camera: torch.cat([camera, torch.stack((camera, camera), dim=0)]),
     "detach": lambda camera: camera.detach(),
 }
 
