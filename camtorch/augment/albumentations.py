@@ -9,24 +9,33 @@ The module is imported by name: `import camtorch.augment.albumentations`. Withou
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import albumentations as A  # noqa: N812 (everybody's name for it)
 import numpy as np
 import torch
 from albumentations.core.type_definitions import Targets
+from torch import nn
 
+from camtorch import augment
 from camtorch.augment import numpy as arrays
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.fields import KINDS, kind_of
 from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
+from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import NAMES
-from camtorch.augment.sample import Sample, Unknown, detached
+from camtorch.augment.ranges import Range
+from camtorch.augment.sample import Calls, Sample, Unknown, detached
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.kept import Kept
+from camtorch.values.arguments import shown
 
 _OWNER = "albumentations.Transform"
 _OWN = "image", "images", "mask", "masks", "bboxes", "keypoints"  # targets of pipelines
+_CLASS = "__class__"  # the key of a saved value's class
+_KINDS: tuple[Any, ...] = tuple, dict, nn.ModuleList, Range, Mirroring, Kept  # of saved values
+_OF_MODULES = nn.Module().__dict__
 
 
 class Transform(FrontEnd, A.DualTransform):
@@ -46,6 +55,9 @@ class Transform(FrontEnd, A.DualTransform):
     drawn by the generator of the pipeline, `A.Compose(..., seed=...)`, and replayed by `A.ReplayCompose`. There are no
     gradients, and volumes are not supported.
 
+    `A.save` writes plain numbers, with cameras as `camera.to_dict()` has them. Before `A.load`, import this module, and
+    those that define augmentations of your own.
+
     Args:
         augmentation: the augmentation to apply.
         camera: for samples that hold none; default: the augmentation's. It is copied, and does not learn. A number is
@@ -64,6 +76,7 @@ class Transform(FrontEnd, A.DualTransform):
     _name = _OWNER
 
     def __init__(self, augmentation: Augmentation, camera: Camera | float | None = None, p: float | None = None):
+        augmentation, camera = _made(augmentation), _made(camera)  # as of `A.load`
         check_front_end(_OWNER, augmentation)
         self.augmentation, self.camera, self._arrays = augmentation, camera, arrays.Transform(augmentation)
         super().__init__(p=augmentation.p if p is None else p)
@@ -72,6 +85,13 @@ class Transform(FrontEnd, A.DualTransform):
     def targets(self) -> dict[str, Callable[..., Any]]:
         nothing: Callable[..., Any] = self.apply  # `apply_with_params` moves all targets together
         return dict.fromkeys((*KINDS, *_OWN, *NAMES, *self.augmentation.fields, "camera"), nothing)
+
+    def to_dict_private(self) -> dict[str, Any]:
+        parts = {name: _plain(getattr(self, name), f"{_OWNER}: {name}") for name in ("augmentation", "camera")}
+        return {"__class_fullname__": self.get_class_fullname(), "p": self.p, **parts}
+
+    def get_dict_with_id(self) -> dict[str, Any]:  # for a replay, which makes the transform of these values again
+        return {**super().to_dict_private(), "id": id(self)}
 
     def __call__(self, *args: Any, force_apply: bool = False, **data: Any) -> dict[str, Any]:
         """Transform a sample of keyword arguments; see the class."""
@@ -123,6 +143,70 @@ class Transform(FrontEnd, A.DualTransform):
         name = self._additional_targets.get(name, name)
         kinds = self.augmentation.fields
         return (name in NAMES or "K" in kinds.values()) and kind_of(name, value, kinds, _OWNER, single=True) == "K"
+
+
+def _plain(value: Any, name: str) -> Any:
+    """Return numbers, strings, lists and dicts, of which `_made` makes `value` again."""
+    for plain in (bool, int, float, str):
+        if isinstance(value, plain):
+            return plain(value)
+    if isinstance(value, Camera):
+        return {_CLASS: "Camera", **value.to_dict()}
+    kind = next((kind for kind in _KINDS if isinstance(value, kind)), None)
+    if isinstance(value, list) or kind in _KINDS[:3]:
+        items = map(list, value.items()) if kind is dict else value  # YAML sorts dicts, and ranges have an order
+        values = [_plain(one, f"{name}[{i}]") for i, one in enumerate(items)]
+        return values if kind is None else {_CLASS: kind.__name__, "values": values}
+    if isinstance(value, Augmentation):
+        state = {n: v for n, v in vars(value).items() if n not in _OF_MODULES and not isinstance(v, Calls)}
+        state |= value._modules | value._parameters | value._buffers
+    elif value is None:
+        return None
+    elif kind is None:
+        must = "numbers, strings, cameras, or lists or dicts of them, to be saved"
+        raise TypeError(f"{name} must be {must}; got {shown(value)}. Pickle the pipeline instead")
+    else:
+        state = value.__getstate__()
+    return {_CLASS: _name_of(type(value)), **{key: _plain(one, f"{name}.{key}") for key, one in state.items()}}
+
+
+def _made(value: Any) -> Any:
+    """Return the value that `_plain` was given, and other values unchanged."""
+    if isinstance(value, list):
+        return [_made(one) for one in value]
+    if not isinstance(value, Mapping):
+        return value
+    state = {key: _made(one) for key, one in value.items()}
+    if (name := state.pop(_CLASS, "Camera")) == "Camera":
+        return Camera.from_dict(state)
+    kinds = {_name_of(kind): kind for kind in (*_KINDS, *_augmentations(Augmentation))}
+    if name not in kinds:
+        raise ValueError(f"{_OWNER}: an augmentation's class must be imported before A.load; got {name!r}")
+    if "values" in state:
+        return kinds[name](state["values"])
+    made: Any = kinds[name].__new__(kinds[name])
+    if not isinstance(made, Augmentation):
+        made.__dict__.update(state)
+        return made
+    nn.Module.__init__(made)
+    parts = {key: one for key, one in state.items() if key == "camera" or isinstance(one, nn.Module)}
+    made.__setstate__({**vars(made), **{key: one for key, one in state.items() if key not in parts}})
+    for key, one in parts.items():
+        setattr(made, key, one)
+    return made
+
+
+def _augmentations(kind: type[Augmentation]) -> Iterator[type[Augmentation]]:
+    """Yield a class and those that are made of it."""
+    yield kind
+    for own in kind.__subclasses__():
+        yield from _augmentations(own)
+
+
+def _name_of(kind: type) -> str:
+    """Return the name of a class of camtorch, and the full name of an augmentation by somebody else."""
+    known = kind in _KINDS or getattr(augment, kind.__name__, None) is kind
+    return kind.__name__ if known else f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _given(target: str, value: Any, camera: Camera) -> Any:

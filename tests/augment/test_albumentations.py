@@ -45,6 +45,30 @@ def test_seeds_and_replays():
     np.testing.assert_array_equal(once["image"], twice["image"])
 
 
+@pytest.mark.parametrize("data_format", ["json", "yaml"])  # YAML sorts keys, and ranges are drawn in their order
+def test_pipelines_are_saved_as_plain_numbers(data_format, tmp_path):
+    flip = ct.augment.HorizontalFlip(landmarks={"keypoints": [(0, 1)]}, p=1, fields={"class": "keep"})
+    lens = ct.augment.RandomLens("dms130", fov="source", min_filled=0)
+    lens.ranges["focal"] = ct.augment.Range(0.7, 0.8)
+    parts = ct.augment.Compose([flip, lens, ct.augment.Resize((24, 32))])
+    guessed = ct.augment.albumentations.Transform(ct.augment.RandomMount(yaw=9, camera=60), p=0.9)
+    given = compose(ct.augment.albumentations.Transform(parts, fisheye()), guessed, seed=3)
+    A.save(given, tmp_path / "pipeline", data_format=data_format)
+    loaded = A.load(tmp_path / "pipeline", data_format=data_format)
+    loaded.set_random_seed(3)
+    expected, result = given(**sample()), loaded(**sample())
+    np.testing.assert_array_equal(result["image"], expected["image"])
+    np.testing.assert_array_equal(result["keypoints"], expected["keypoints"])
+    assert torch.equal(result["camera"].intrinsics, expected["camera"].intrinsics)
+    lens.table = torch.ones(3)
+    with pytest.raises(TypeError, match=r"augmentations\[1\].table must be numbers.*; got Tensor.*Pickle the pipeline"):
+        A.to_dict(given)
+    unknown = A.to_dict(compose(guessed))
+    unknown["transform"]["transforms"][0]["augmentation"]["__class__"] = "mine.Own"
+    with pytest.raises(ValueError, match=r"class must be imported before A\.load; got 'mine\.Own'"):
+        A.from_dict(unknown)
+
+
 def test_what_has_no_place_is_where_its_params_look():
     wide = ct.KannalaBrandt([18.0, 18.0, 31.5, 23.5], image_size=SIZE).requires_grad_(False)
     mount = ct.augment.RandomCamera("pinhole", fov=60, yaw=(150, 150), pitch=0, roll=0, min_filled=0)
