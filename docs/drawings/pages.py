@@ -13,8 +13,8 @@ EXAMPLES = DOCS.parent / "examples"
 
 def sections(page: str) -> dict[str, str]:
     """Headings of the third level in a page of the gallery, and what stands below each, in order."""
-    parts = re.split(r"^#{1,3} (.*)$", (GALLERY / page).read_text(), flags=re.M)
-    levels = re.findall(r"^(#{1,3}) ", (GALLERY / page).read_text(), flags=re.M)
+    parts = re.split(r"^#{2,3} (.*)$", (GALLERY / page).read_text(), flags=re.M)
+    levels = re.findall(r"^(#{2,3}) ", (GALLERY / page).read_text(), flags=re.M)
     found = zip(levels, parts[1::2], parts[2::2], strict=True)
     return {title.split(" {")[0]: text for level, title, text in found if level == "###"}
 
