@@ -46,6 +46,6 @@ def rendered(notebook: dict[str, Any], name: str) -> tuple[str, dict[str, bytes]
                 parts.append(f"![{heading}]({figure})")
             else:
                 text = "".join(output.get("text", data.get("text/plain", "")))
-                lines = (textwrap.fill(line, 88) if len(line) > 100 else line for line in text.rstrip().splitlines())
+                lines = (textwrap.fill(line, 80) if len(line) > 80 else line for line in text.rstrip().splitlines())
                 parts.append("```text\n" + "\n".join(lines) + "\n```")
     return "\n\n".join(parts) + "\n", figures
