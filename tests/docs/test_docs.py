@@ -9,6 +9,7 @@ import re
 import runpy
 import shlex
 import shutil
+import subprocess
 import sys
 from contextlib import nullcontext
 from pathlib import Path
@@ -27,6 +28,7 @@ from camtorch.boards.boards import Chessboard
 from camtorch.cli.main import main
 
 ROOT = Path(__file__).parents[2]
+COLUMNS = 80  # of code: what a page shows without scrolling
 FILES = ROOT / "tests" / "files"
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 
@@ -45,7 +47,7 @@ def blocks(language: str):
 def commands():
     for param in blocks("bash"):
         page, line, code = param.values
-        lines = [part for part in re.split(r"\n| && ", code) if part.startswith("camtorch ")]
+        lines = [part for part in re.split(r"\n| && ", code.replace("\\\n", "")) if part.startswith("camtorch ")]
         if lines:
             yield pytest.param(page, line, lines, id=param.id, marks=param.marks)
 
@@ -139,6 +141,22 @@ def test_photographs_are_read_as_they_are_stored():
     calls = [call for path in texts for call in re.findall(r"imread\([^()]*\)", path.read_text(errors="ignore"))]
     assert len(calls) >= 2
     assert [call for call in calls if "IMREAD_IGNORE_ORIENTATION" not in call] == []
+
+
+def test_code_fits_into_the_width_of_a_page():
+    for page in PAGES:
+        blocks = re.findall(r"^( *)```.*\n((?:.*\n)*?)\1```$", page.read_text(), re.M)
+        lines = [line.removeprefix(indent) for indent, block in blocks for line in block.splitlines()]
+        long = [line for line in lines if len(line) > COLUMNS and page.name != "README.md"]
+        assert long == [], page
+
+
+def test_python_in_pages_has_the_format_of_their_width():
+    """pyproject.toml leaves it to this test: the rest of the package is wider."""
+    pages = [path for form in ("md", "ipynb") for path in (ROOT / "docs").rglob(f"*.{form}")]
+    ruff = [sys.executable, "-m", "ruff", "format", "--no-cache", f"--line-length={COLUMNS}"]
+    done = subprocess.run([*ruff, "--diff", *pages], capture_output=True, text=True)
+    assert done.returncode == 0, f"{' '.join(ruff[2:])} makes it so:\n{done.stdout}{done.stderr}"
 
 
 def test_every_public_name_has_a_place_in_the_reference():
