@@ -288,13 +288,13 @@ def draw(kept: dict[str, Any], output: str | Path) -> None:
         "400 of one camera": ["plain"],
     }
     panels = {
-        "gaze, degrees; 1,000 steps": (1, ""),
-        "gaze, degrees; 4,000 steps": (1, ", longer"),
+        "gaze, °; 1,000 steps": (1, ""),
+        "gaze, °; 4,000 steps": (1, ", longer"),
         "landmarks, %; 1,000 steps": (0, ""),
         "landmarks, %; 4,000 steps": (0, ", longer"),
     }
-    figure, axes = plt.subplots(1, len(panels), figsize=(14, 4.2), layout="constrained")
-    for axis, (title, (which, suffix)) in zip(axes, panels.items(), strict=True):
+    figure, axes = plt.subplots(2, 2, figsize=(6.6, 7.6), layout="constrained")  # a phone shows it readable
+    for axis, (title, (which, suffix)) in zip(axes.flat, panels.items(), strict=True):
         for colour, (label, names) in zip(COLOURS, curves.items(), strict=False):
             seeds = {name: values(kept, name + suffix, "mounts", which) for name in names}
             errors = [error for error in seeds.values() if error]
@@ -304,15 +304,18 @@ def draw(kept: dict[str, Any], output: str | Path) -> None:
             style = "--" if len(names) == 1 else "o-"
             axis.plot(counts, [*map(statistics.mean, errors)], style, color=colour, label=label, markersize=4)
             axis.fill_between(counts, [*map(min, errors)], [*map(max, errors)], color=colour, alpha=0.15, linewidth=0)
-        axis.set_title(title, fontsize="medium")
+        axis.set_title(title, fontsize="large")
+        axis.tick_params(labelsize="large")
         axis.set_xscale("log")
         axis.set_xticks([80, 400, 2000, 10000], ["80", "400", "2,000", "10,000"])
         axis.minorticks_off()
         axis.set_ylim(0, 13 if which else 19)
-        axis.set_xlabel("the new cameras' own images")
         axis.spines[["top", "right"]].set_visible(False)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
-    figure.savefig(output, dpi=90)
+    for axis in axes[1]:
+        axis.set_xlabel("the new cameras' own images", fontsize="large")
+    entries = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*entries, loc="outside lower center", fontsize="large", frameon=False)
+    figure.savefig(output, dpi=120)
     plt.close(figure)
 
 
