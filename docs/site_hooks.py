@@ -1,4 +1,4 @@
-"""Hooks of mkdocs: pages from the repository's root and the library, llms.txt, and images that load lazily."""
+"""Hooks of mkdocs: pages from the root and the library, llms.txt, images that load lazily, names that wrap."""
 
 import io
 import re
@@ -43,7 +43,10 @@ def _lines(nav: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Let images load when they are scrolled to, with their size reserved; wide images are links to themselves."""
+    """Let images load when they are scrolled to, with their size reserved, and long names in tables wrap.
+
+    Wide images are links to themselves.
+    """
 
     def shown(found: re.Match[str]) -> str:
         link, tag = found[1] or "", found[2]
@@ -56,4 +59,8 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
         tag = tag.replace("<img ", f'<img loading="lazy" width="{width}" height="{height}" ', 1)
         return f"{link}{tag}" if link or width < WIDE else f'<a href="{source[1]}">{tag}</a>'
 
+    def wrapping(found: re.Match[str]) -> str:
+        return re.sub(r"(?<=[\w,)][._,(=/])(?=[\w*&])", "<wbr>", found[0])
+
+    html = re.sub(r"<td.*?</td>", lambda cell: re.sub(r"<code>[^<]*</code>", wrapping, cell[0]), html, flags=re.S)
     return re.sub(r"(<a [^>]*>\s*)?(<img [^>]*>)", shown, html)

@@ -8,3 +8,19 @@ for (const frame of document.querySelectorAll("iframe.viewer")) {
   frame.addEventListener("load", follow);
   follow(); // of a frame that has loaded already
 }
+
+// A table that is wider than the page becomes a list of its rows, whose cells name their columns: see site.css.
+const tables = document.querySelectorAll(".md-typeset table:not([class])");
+for (const table of tables) {
+  const heads = [...table.querySelectorAll("th")].map((head) => head.textContent.trim());
+  for (const row of table.tBodies[0].rows) [...row.cells].forEach((cell, i) => (cell.dataset.head = heads[i]));
+}
+const fit = () => {
+  for (const table of tables) {
+    table.removeAttribute("data-rows");
+    table.toggleAttribute("data-rows", table.scrollWidth > table.closest("article").clientWidth);
+  }
+};
+addEventListener("resize", fit);
+addEventListener("toggle", fit, true); // of a folded table, which has no width before
+fit();
