@@ -776,7 +776,7 @@ const Viewer = (() => {
       ...lines, "",
       'photo = np.array(Image.open("photo.jpg").convert("RGB"))',
       "image = torch.from_numpy(photo).permute(2, 0, 1)[None]  # (1, 3, H, W)",
-      "moved = warp(image)  # the image on the right",
+      "moved = warp(image)  # the second image",
       'Image.fromarray(moved[0].permute(1, 2, 0).numpy()).save("moved.png")',
       `landmarks, there = warp.transform_points(torch.tensor([${labels.points.map((p) => listed(p.map((w) => +w.toFixed(2)))).join(", ")}]))`,
     ].join("\n");
