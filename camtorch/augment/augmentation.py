@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -208,14 +209,14 @@ class Augmentation(SampleTransform):
             )
 
         def part(rows: list[int] | None, source: Camera) -> Part:
-            return self._part(rows, source, draw if rows is None else {n: value[rows] for n, value in draw.items()})
+            return self._part(source, draw if rows is None else {n: value[rows] for n, value in draw.items()})
 
         looks = not isinstance(applied, Tensor) or may_look(applied) or count == 0
         chosen = applied if isinstance(applied, list) else applied.tolist() if looks else []
         if all(chosen):  # traced, all rows move, and a gate chooses
             gate = None if looks or self.p == 1 else applied
             if not isinstance(camera, Mixed):
-                return Change(count, [self._part(None, camera, draw)], gate=gate)
+                return Change(count, [self._part(camera, draw)], gate=gate)
             return by_kinds(count, camera, part, gate)
         parts, camera = [], alone(camera)
         for rows, group in camera.groups if isinstance(camera, Mixed) else [(list(range(count)), camera)]:
@@ -224,7 +225,7 @@ class Augmentation(SampleTransform):
                 if here:
                     source = group[here] if group.batch_shape and len(here) < len(rows) else group
                     own = [rows[n] for n in here]
-                    parts.append(part(own, source) if moves else Part(own, None, source))
+                    parts.append(replace(part(own, source) if moves else Part(source), rows=own))
         check_sizes((part.image_size for part in parts), self._name)
         return Change(count, parts, mixed=isinstance(camera, Mixed))
 
@@ -248,23 +249,18 @@ class Augmentation(SampleTransform):
                 raise ValueError(f"{self._name}: draw[{name!r}] must be finite; got {value.tolist()}")
         return values
 
-    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
+    def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._values(source, draw)
         target, rotation = self._new_camera(source, values)
         if self.min_filled:
             factor, turned, found = enough(source, target, rotation, self.min_filled)
             target, rotation = scaled(target, factor), None if rotation is None else turned
             self._tell_of(source, lambda: target, factor, found)
-        return self._between(rows, source, values, target, rotation)
+        return self._between(source, target, rotation, values)
 
-    def _between(
-        self, rows: list[int] | None, source: Camera, values: Mapping[str, Any], target: Camera, rotation: Tensor | None
-    ) -> Part:
+    def _between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
         """Return the part whose samples go from a source to a target, with what of the values is beside the cameras."""
-        beside = self.beside_the_camera.intersection(values)
-        more = self._like(source, {name: values[name] for name in values if name in beside}) if beside else {}
-        warp = self._warp(source, target, rotation)
-        return Part(rows, warp, source, *self._seen_through(warp, more))
+        return Part(source, Warp(source, target, rotation, **self.options))
 
     def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
         """Return what was drawn, (*B,) or (*B, size), where all is alike once: one map then serves all samples."""
@@ -284,13 +280,6 @@ class Augmentation(SampleTransform):
         """Return the values as tensors in the source's dtype and on its device."""
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
         return {n: torch.as_tensor(value, dtype=dtype, device=source.intrinsics.device) for n, value in values.items()}
-
-    def _warp(self, source: Camera, target: Camera, rotation: Tensor | None) -> Warp:
-        return Warp(source, target, rotation, **self.options)
-
-    def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
-        """Return `shades` and `light` of a part: the effect of its lens on colours and light."""
-        return None, None
 
     def _tell_of(self, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor) -> None:
         """Warn, once, if filled parts (*B,) are less than `min_filled` with these factors (*B,) on focal lengths."""

@@ -227,41 +227,40 @@ class CameraDrawer(Augmentation):
         own_lens = like is None and not self._is_real
         return None if found is None else found.drawn(values, source if own_lens else found.base, self.options)
 
-    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
+    def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._values(source, draw)
         made = self._drawn(source, values, self.min_filled)
         if made is None:
-            return super()._part(rows, source, draw)
+            return super()._part(source, draw)
         if self.min_filled and (min(made.found, default=1) < self.min_filled or max(made.factor, default=1) > 1):
             factor, found = (torch.tensor(values, dtype=torch.float64) for values in (made.factor, made.found))
             self._tell_of(source, lambda: made.target, factor, found)
         simple = self.options["tolerance"] and not self.options["antialias"] and made.native is not None
         simple = simple and self.beside_the_camera.isdisjoint(self.ranges)
         if simple and not isinstance(source, PANORAMAS) and not isinstance(made.base, PANORAMAS):
-            return Part(rows, made, source)
-        return self._between(rows, source, values, made.target, made.rotation)
+            return Part(source, made)
+        return self._between(source, made.target, made.rotation, values)
 
-    def _warp(self, source: Camera, target: Camera, rotation: Tensor | None) -> Warp:
-        return Warp.unchecked(source, target, self.options).turned_by(rotation)
-
-    def _seen_through(self, warp: Warp, values: Mapping[str, Tensor]) -> tuple[tuple[Warp, Warp] | None, Tensor | None]:
-        shades = light = None
-        if "chromatic" in values:
-            red, blue = (scaled(warp.target, 1 + values["chromatic"][..., i]) for i in (0, 1))
-            shades = self._warp(warp.source, red, warp.rotation), self._warp(warp.source, blue, warp.rotation)
-        if "vignetting" in values:
+    def _between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
+        """Return the part with the effect of the lens on colours and light."""
+        beside = self._like(source, {name: values[name] for name in self.beside_the_camera.intersection(values)})
+        cameras, light = [target], None
+        if "chromatic" in beside:
+            cameras += [scaled(target, 1 + beside["chromatic"][..., i]) for i in (0, 1)]
+        warp, *others = [Warp.unchecked(source, camera, self.options).turned_by(rotation) for camera in cameras]
+        if "vignetting" in beside:
             # (B or 1, 1, H, W): it is lost by the square of the distance, so much in the farthest corner
-            height, width = warp.target.height, warp.target.width
-            cx, cy = warp.target.intrinsics.detach()[..., 2:].reshape(-1, 2, 1, 1).unbind(1)
-            grid = warp.target.pixel_grid()
+            height, width = target.height, target.width
+            cx, cy = target.intrinsics.detach()[..., 2:].reshape(-1, 2, 1, 1).unbind(1)
+            grid = target.pixel_grid()
             square = (grid[..., 0] - cx) ** 2 + (grid[..., 1] - cy) ** 2
             reach = [torch.maximum(c, side - 1 - c) for c, side in ((cx, width), (cy, height))]
             farthest = (reach[0] ** 2 + reach[1] ** 2).clamp(min=1e-12)
-            light = (1 - values["vignetting"].reshape(-1, 1, 1) * square / farthest).unsqueeze(1)
-        if "cos4" in values:
-            natural = vignetting(warp.target, values["cos4"])
+            light = (1 - beside["vignetting"].reshape(-1, 1, 1) * square / farthest).unsqueeze(1)
+        if "cos4" in beside:
+            natural = vignetting(target, beside["cos4"])
             light = natural if light is None else light * natural
-        return shades, light
+        return Part(source, warp, (others[0], others[1]) if others else None, light)
 
     def _tell_of(self, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor) -> None:
         """Warn also, once a process, if `min_filled`, and not a draw, zoomed to less than the `fov` asked for."""

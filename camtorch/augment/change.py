@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Any, TypeVar
 
 import torch
@@ -43,16 +42,16 @@ def as_is(camera: Camera, rows: Tensor) -> Tensor:
 
 @dataclass(slots=True)
 class Drawn:
-    """New cameras as compiled code wrote their numbers, of which modules are made when somebody asks for them."""
+    """A warp to new cameras of which compiled code wrote the numbers; modules are made when somebody asks for them."""
 
-    base: Camera  # of whose model they are
+    base: Camera  # of whose model the new cameras are
     intrinsics: Tensor  # (4,) of one, or (B, 4)
     distortion: Tensor  # (n,) of one, or (B, n)
     image_size: tuple[int, int]
     rotation: Tensor | None  # (3, 3) or (B, 3, 3), or None
-    options: Options  # of the warp that leads to them
+    options: Options  # of the warp
     start: Native | None  # the cameras before, for compiled code
-    native: Native | None  # these ones; None where they have to be found
+    native: Native | None  # the new ones; None where they have to be found
     factor: Sequence[float]  # (B,), on the focal lengths, that `min_filled` asks for
     found: Sequence[float]  # (B,): the share of each image that is filled
     is_turn: bool = True  # of a single one: whether the rotation is no mirror
@@ -61,18 +60,18 @@ class Drawn:
 
     @property
     def target(self) -> Camera:
-        """The one of the change, which nobody else gets."""
+        """The new cameras of the change, which nobody else gets."""
         if self.own is None:
             if self.native is not None:
                 _ = self.native.lenses  # kept for cameras of the same numbers
-            self.own = self.camera()
+            self.own = self.new_target()
         return self.own
 
-    def camera(self, count: int | None = None) -> Camera:
-        """Return a new camera of these numbers; a count makes a batch of a single one."""
+    def new_target(self, count: int | None = None) -> Camera:
+        """Return the new cameras, of memory of their own; a count makes a batch of a single one."""
         if torch.is_inference_mode_enabled():  # what that makes could not be used in a graph later
             with torch.inference_mode(False), torch.no_grad():
-                return self.camera(count)
+                return self.new_target(count)
         numbers, k = self.intrinsics, self.distortion
         if count is not None:
             numbers, k = numbers.expand(count, -1), k.expand(count, -1)
@@ -90,11 +89,11 @@ class Drawn:
 class Part:
     """Rows of a batch that move by one warp, or stay as they are."""
 
-    rows: list[int] | None  # which samples of the batch, or None for all
-    moves: Warp | Drawn | None  # by what; None: nothing happens to these rows
     camera: Camera  # before the change; the warp's source
+    moves: Warp | Drawn | None = None  # by what; None: nothing happens to these rows
     shades: tuple[Warp, Warp] | None = None  # how red and blue move, where they do not move as green
     light: Tensor | None = None  # (n or 1, 1, H', W'): what the lens lets through
+    rows: list[int] | None = None  # which samples of the batch, or None for all
 
     @property
     def warp(self) -> Warp:
@@ -129,54 +128,52 @@ class Part:
 
     def take(self, index: list[int]) -> Part:
         """Return these rows of the part as a part of its own."""
-        camera = _rows_of(self.camera, index)
-        light = self.light if self.light is None or len(self.light) == 1 else self.light[index]
+
+        def of(camera: Camera) -> Camera:
+            return camera[index] if camera.batch_shape else camera  # which serves all rows
 
         def rows_of(warp: Warp) -> Warp:
             rotation = warp.rotation if warp.rotation is None or warp.rotation.ndim == 2 else warp.rotation[index]
-            return warp.rows_of(camera, _rows_of(warp.target, index), rotation, index)
+            return warp.rows_of(camera, of(warp.target), rotation, index)
 
+        camera, light = of(self.camera), self.light
+        light = light if light is None or len(light) == 1 else light[index]
         return replace(self.by(rows_of), rows=None, camera=camera, light=light)
 
-
-def _rows_of(camera: Camera, index: list[int]) -> Camera:
-    """Return the cameras of these rows; one without batch dims serves all of them."""
-    return camera[index] if camera.batch_shape else camera
-
-
-def _joined(a: Part, b: Part) -> Part:
-    """Return one part that does with one warp what two do one after the other."""
-    if b.moves is None:
-        return a
-    if a.moves is None:
-        return replace(b, rows=a.rows, camera=a.camera)
-    if not isinstance(b.moves, Drawn) and b.moves.keeps_lens:
-        return a.by(b.moves.follow)
-    first, rotation = a.moves.rotation, b.moves.rotation  # (3, 3) or (B, 3, 3): the first turn, then the second
-    if first is not None and rotation is not None:
-        dtype = torch.promote_types(first.dtype, rotation.dtype)
-        first = (rotation.to(dtype).unsqueeze(-1) * first.to(dtype).unsqueeze(-3)).sum(-2)
-    rotation = rotation if first is None else first
-    if not isinstance(b.moves, AffineWarp):
-        if a.shades is not None or a.light is not None:
+    def then(self, second: Part) -> Part:
+        """Return one part that does with one warp what this and another one of the same rows do in turn."""
+        first, last = self.moves, second.moves
+        if last is None:
+            return self
+        if first is None:
+            return replace(second, camera=self.camera)
+        if not isinstance(last, Drawn) and last.keeps_lens:
+            return self.by(last.follow)
+        turned, rotation = first.rotation, last.rotation  # (3, 3) or (B, 3, 3): the first turn, then the second
+        if turned is not None and rotation is not None:
+            dtype = torch.promote_types(turned.dtype, rotation.dtype)
+            turned = (rotation.to(dtype).unsqueeze(-1) * turned.to(dtype).unsqueeze(-3)).sum(-2)
+        rotation = rotation if turned is None else turned
+        if isinstance(last, AffineWarp):
+            size = last.target.image_size
+            if isinstance(first, AffineWarp):
+                matrix = after(last.map, first.map)
+                return replace(self, moves=AffineWarp(self.camera, edited(self.camera, matrix, size), matrix, rotation))
+            light = None if self.light is None else last(self.light, padding_mode="border")
+            moved = self.by(lambda warp: MirrorWarp(self.camera, edited(warp.target, last.map, size), rotation))
+            return replace(moved, light=light)
+        if self.shades is not None or self.light is not None:
             raise ValueError(
                 "Compose: chromatic and vignetting must be those of the last lens of a chain; got an earlier one, "
                 "whose colours or light would be seen through another lens"
             )
-        if isinstance(b.moves, Drawn) and not a.camera.batch_shape:
-            start = a.moves.start if isinstance(a.moves, Drawn) else _single(a.camera)
+        if isinstance(last, Drawn) and not self.camera.batch_shape:
+            start = first.start if isinstance(first, Drawn) else _single(self.camera)
             is_turn = rotation is None or (rotation.ndim == 2 and is_right(rotation))
-            moves = replace(b.moves, rotation=rotation, start=start, is_turn=is_turn)
-            return replace(b, rows=a.rows, camera=a.camera, moves=moves)
-        moved = b.by(lambda warp: MirrorWarp(a.camera, warp.target, rotation))
-        return replace(moved, rows=a.rows, camera=a.camera)
-    edit, size = b.moves.map, b.moves.target.image_size
-    if isinstance(a.moves, AffineWarp):
-        matrix = after(edit, a.moves.map)
-        return replace(a, moves=AffineWarp(a.camera, edited(a.camera, matrix, size), matrix, rotation))
-    light = None if a.light is None else b.moves(a.light, padding_mode="border")
-    moved = a.by(lambda warp: MirrorWarp(a.camera, edited(warp.target, edit, size), rotation))
-    return replace(moved, light=light)
+            moves = replace(last, rotation=rotation, start=start, is_turn=is_turn)
+            return replace(second, camera=self.camera, moves=moves)
+        moved = second.by(lambda warp: MirrorWarp(self.camera, warp.target, rotation))
+        return replace(moved, camera=self.camera)
 
 
 def _single(camera: Camera) -> Native | None:
@@ -214,40 +211,92 @@ class Change:
     @property
     def source(self) -> Camera:
         """The cameras before, a batch of all samples."""
-        return self._cameras([part.camera for part in self.parts])
+        return self._together([part.camera for part in self.parts])
 
     @property
     def target(self) -> Camera:
         """The cameras after."""
-        after = [part.target for part in self.parts]
-        if self.gate is not None:
-            gates = [self.gate if part.rows is None else self.gate[part.rows] for part in self.parts]
-            chosen = zip(gates, after, self.parts, strict=True)
-            after = [_chosen(gate, camera, part.camera) for gate, camera, part in chosen]
-        return self._cameras(after)
+        return self._together([part.target if self.gate is None else self._gated(part) for part in self.parts])
+
+    def _gated(self, part: Part) -> Camera:
+        """Return the cameras of a part after the change, where the gate is open, and those before it elsewhere."""
+        assert self.gate is not None
+        new, gate = part.target, self.gate if part.rows is None else self.gate[part.rows]
+        gate = gate.to(new.intrinsics.device).unsqueeze(-1)
+        intrinsics = torch.where(gate, new.intrinsics, part.camera.intrinsics)
+        return remade(new, intrinsics=intrinsics, distortion=torch.where(gate, new.distortion, part.camera.distortion))
+
+    def _together(self, cameras: list[Camera]) -> Camera:
+        """Return cameras, given part by part, as a batch of all samples."""
+        batches = [camera.expand(n) for camera, n in zip(cameras, self._counts, strict=True)]
+        rows = [part.rows for part in self.parts if part.rows is not None]
+        if not rows:
+            return batches[0]
+        check_sizes(camera.size_for("Change") for camera in cameras)
+        together = Mixed.of_groups(list(zip(rows, batches, strict=True)))
+        groups = together.groups
+        return together if self.mixed or len(groups) > 1 else groups[0][1]
+
+    def _in_order(self, pieces: Sequence[Tensor]) -> Tensor:
+        """Return rows, given part by part, as a batch of all samples."""
+        if self._order is None:
+            return pieces[0]
+        if pieces[0].ndim > 2:  # of images: the rest keeps its shape
+            check_sizes((piece.shape[-2], piece.shape[-1]) for piece in pieces)
+        return torch.cat(tuple(pieces))[self._order]
+
+    @property
+    def _counts(self) -> list[int]:
+        return [self.count if part.rows is None else len(part.rows) for part in self.parts]
 
     @property
     def single(self) -> Camera:
         """Return the camera after, of a change of one sample; its own, not that of the change."""
         if isinstance(moves := self.parts[0].moves, Drawn):
-            return moves.camera()
+            return moves.new_target()
         return (self.target[0] if self.gate is not None else alone(self.parts[0].target)).clone()
 
     @property
     def several(self) -> Camera:
         """Return the cameras after, a batch of all samples; their own, not those of the change."""
         moves = self.parts[0].moves
-        if isinstance(moves, Drawn) and self._order is None and not self.mixed:
-            return moves.camera(None if moves.intrinsics.ndim == 2 else self.count)
+        if isinstance(moves, Drawn) and self.parts[0].rows is None and not self.mixed:
+            return moves.new_target(None if moves.intrinsics.ndim == 2 else self.count)
         return self.target.clone()
 
     @property
     def single_rotation(self) -> Tensor:
         """(3, 3): the rotation of a change of one sample, of its own memory."""
-        moves = self.parts[0].moves
-        if not isinstance(moves, Drawn):
+        part = self.parts[0]
+        rotation = part.rotation
+        if self.gate is not None or (rotation is not None and rotation.ndim > 2):
             return self.rotation[0].clone()
-        return (no_turn(moves.distortion.dtype) if moves.rotation is None else moves.rotation).clone()
+        return _eye(part.camera.intrinsics) if rotation is None else rotation.clone()
+
+    @property
+    def rotation(self) -> Tensor:
+        """(count, 3, 3): `ray_after = R ray_before`."""
+        rotation = self._turns([part.rotation for part in self.parts])
+        if self.gate is not None:
+            rotation = torch.where(self.gate.to(rotation.device)[:, None, None], rotation, _eye(rotation))
+        return rotation
+
+    @property
+    def mirrored(self) -> Tensor | None:
+        """(count,) bool: which samples are seen in a mirror; None if none is."""
+        turns = [part.rotation if isinstance(part.moves, (Drawn, MirrorWarp)) else None for part in self.parts]
+        if all(turn is None for turn in turns):
+            return None
+        x, y, z = self._turns(turns).unbind(-2)
+        rows = (torch.linalg.cross(x, y) * z).sum(-1) < 0  # the determinant, of which torch's own takes many steps
+        return None if known_true(~rows) else rows
+
+    def _turns(self, rotations: Sequence[Tensor | None]) -> Tensor:
+        """Return rotations, given part by part, as those of all samples, (count, 3, 3)."""
+        turns = []
+        for part, rotation, n in zip(self.parts, rotations, self._counts, strict=True):
+            turns.append((_eye(part.camera.intrinsics) if rotation is None else rotation).expand(n, 3, 3))
+        return self._in_order(turns)
 
     def leads_to(self, camera: Camera | Sequence[Camera], rotation: Tensor | None = None) -> bool:
         """Whether these may be the cameras after, by number, intrinsics and rotation, where one may look."""
@@ -258,46 +307,6 @@ class Change:
             and not known_false(torch.isclose(ours.double(), its.to(ours.device).double(), _ROUNDED, near))
             for ours, its, near in pairs
         )
-
-    def _cameras(self, cameras: list[Camera]) -> Camera:
-        batches = [camera.expand(n) for camera, n in zip(cameras, self._counts, strict=True)]
-        rows = [part.rows for part in self.parts if part.rows is not None]
-        if not rows:
-            return batches[0]
-        check_sizes(camera.size_for("Change") for camera in cameras)
-        together = Mixed.of_groups(list(zip(rows, batches, strict=True)))
-        groups = together.groups
-        return together if self.mixed or len(groups) > 1 else groups[0][1]
-
-    @property
-    def _counts(self) -> list[int]:
-        return [self.count if part.rows is None else len(part.rows) for part in self.parts]
-
-    @property
-    def rotation(self) -> Tensor:
-        """(count, 3, 3): `ray_after = R ray_before`."""
-        parts = []
-        for part, n in zip(self.parts, self._counts, strict=True):
-            parts.append((_eye(part.camera.intrinsics) if part.rotation is None else part.rotation).expand(n, 3, 3))
-        rotation = parts[0] if self._order is None else torch.cat(parts)[self._order]
-        if self.gate is not None:
-            rotation = torch.where(self.gate.to(rotation.device)[:, None, None], rotation, _eye(rotation))
-        return rotation
-
-    @property
-    def mirrored(self) -> Tensor | None:
-        """(count,) bool: which samples are seen in a mirror; None if none is."""
-        moves = [part.moves for part in self.parts]
-        turns = [each.rotation if isinstance(each, (Drawn, MirrorWarp)) else None for each in moves]
-        if all(turn is None for turn in turns):
-            return None
-        device = self.parts[0].camera.intrinsics.device
-        flags = [
-            torch.zeros(n, dtype=torch.bool, device=device) if t is None else _is_mirror(t).expand(n)
-            for t, n in zip(turns, self._counts, strict=True)
-        ]
-        rows = flags[0] if self._order is None else torch.cat(flags)[self._order]
-        return None if known_true(~rows) else rows
 
     def then(self, second: Change) -> Change:
         """Return this change followed by one of the cameras that it ends with, by single warps.
@@ -310,7 +319,7 @@ class Change:
             )
         mixed = self.mixed or second.mixed
         if all(part.rows is None for part in (*self.parts, *second.parts)):
-            return Change(self.count, [_joined(self.parts[0], second.parts[0])], mixed=mixed)
+            return Change(self.count, [self.parts[0].then(second.parts[0])], mixed=mixed)
         parts = []
         everyone = list(range(self.count))
         for a in self.parts:
@@ -322,7 +331,7 @@ class Change:
                     rows = [own[i] for i in of_a]
                     one = a if len(rows) == len(own) else a.take(of_a)
                     other = b if rows == its else b.take([place[row] for row in rows])
-                    parts.append(replace(_joined(one, other), rows=rows))
+                    parts.append(replace(one.then(other), rows=rows))
         return Change(self.count, parts, mixed=mixed)
 
     def with_options(self, options: Options) -> Change:
@@ -352,7 +361,7 @@ class Change:
         if self._inverse is not None:  # with the maps that it has made
             return self._inverse
         parts = [
-            part if part.moves is None else Part(part.rows, part.warp.inverse(), part.warp.target)
+            part if part.moves is None else Part(part.target, part.warp.inverse(), rows=part.rows)
             for part in self.parts
         ]
         self._inverse = Change(self.count, parts, mixed=self.mixed, gate=self.gate)
@@ -372,10 +381,8 @@ class Change:
             return stay(part.camera, rows) if part.moves is None else move(part, rows)
 
         results = [of(part) for part in self.parts]
-        gate, order = self.gate, self._order
-        moved = results[0]
-        if order is not None:
-            moved = _both(lambda pieces: _rows_together(pieces)[order], *results)
+        gate = self.gate
+        moved = results[0] if self._order is None else _both(self._in_order, *results)
         if gate is not None:
             moved = _both(lambda pair: gated(gate, *pair), moved, stay(self.parts[0].camera, value))
         return moved
@@ -521,7 +528,8 @@ def by_kinds(
     camera = alone(camera)
     if not isinstance(camera, Mixed):
         return Change(count, [part(None, camera)], gate=gate)
-    return Change(count, [part(rows, source) for rows, source in camera.groups], mixed=True, gate=gate)
+    parts = [replace(part(rows, source), rows=rows) for rows, source in camera.groups]
+    return Change(count, parts, mixed=True, gate=gate)
 
 
 def as_one(camera: Camera | Sequence[Camera]) -> Camera:
@@ -534,28 +542,8 @@ def alone(camera: Camera) -> Camera:
     return camera[0] if camera.batch_shape == (1,) else camera
 
 
-def _is_mirror(rotation: Tensor) -> Tensor:
-    """Whether matrices (*B, 3, 3) have a negative determinant, (*B,); torch's own takes many steps."""
-    x, y, z = rotation.unbind(-2)
-    negative: Tensor = (torch.linalg.cross(x, y) * z).sum(-1) < 0
-    return negative
-
-
 def _eye(like: Tensor) -> Tensor:
     return torch.eye(3, dtype=like.dtype, device=like.device)
-
-
-@lru_cache(maxsize=4)
-def no_turn(dtype: torch.dtype) -> Tensor:
-    """Return the identity, which nobody may change."""
-    with torch.inference_mode(False):
-        return torch.eye(3, dtype=dtype, device="cpu")
-
-
-def _rows_together(pieces: Sequence[Tensor]) -> Tensor:
-    if pieces[0].ndim > 2:  # of images: the rest keeps its shape
-        check_sizes((piece.shape[-2], piece.shape[-1]) for piece in pieces)
-    return torch.cat(tuple(pieces))
 
 
 def check_sizes(sizes: Iterable[tuple[int, int]], owner: str = "Change") -> None:
@@ -571,16 +559,6 @@ def check_sizes(sizes: Iterable[tuple[int, int]], owner: str = "Change") -> None
 def gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:
     """Return rows of `moved` where the gate (B,) is open, of `kept` elsewhere."""
     return torch.where(gate.to(moved.device).reshape(-1, *[1] * (moved.ndim - 1)), moved, kept.to(moved.dtype))
-
-
-def _chosen(gate: Tensor, target: Camera, source: Camera) -> Camera:
-    """Return cameras (n,): the target if the gate (n,) is open, else the source."""
-    gate = gate.to(target.intrinsics.device).unsqueeze(-1)
-    return remade(
-        target,
-        intrinsics=torch.where(gate, target.intrinsics, source.intrinsics),
-        distortion=torch.where(gate, target.distortion, source.distortion),
-    )
 
 
 def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Moved) -> Moved:

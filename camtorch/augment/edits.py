@@ -103,12 +103,12 @@ def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, o
             if one is not None:
                 matrix = one if matrix is None else after(one, matrix)
         if matrix is None:
-            return Part(rows, None, source)
+            return Part(source)
         may_be_one = isinstance(matrix, Tensor) and matrix.ndim == 3 and not source.batch_shape
         if may_be_one and known_true(as_tensor(matrix) == as_tensor(matrix)[:1]):
             matrix = as_tensor(matrix)[0]  # one map serves the whole batch
         warp = AffineWarp(source, edited(source, matrix, size), matrix, _turn(matrix, source), **options)
-        return Part(rows, warp, source)
+        return Part(source, warp)
 
     return by_kinds(len(edits[0][1]["apply"]), camera, part)
 

@@ -123,7 +123,7 @@ class FaceNormalizer(SampleTransform):
         focal = (self.focal / self.distance * distance).expand(-1, 2)
         intrinsics = torch.cat((focal, focal.new_tensor(self.axis).expand(len(focal), 2)), -1)
         target = pinhole(intrinsics, self.image_size)
-        return Change(len(centre), [Part(None, Warp(camera, target, rotation, **self.options), camera)])
+        return Change(len(centre), [Part(camera, Warp(camera, target, rotation, **self.options))])
 
     @on_samples
     def forward(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
@@ -172,7 +172,7 @@ class FaceNormalizer(SampleTransform):
         rotation = rotation if before is None else rotation @ before.mT
         rotation = rotation if rotation.ndim == 3 else rotation.unsqueeze(0)
         warp = Warp(source, normal, rotation.to(normal.intrinsics), **self.options)
-        moved = self._moved(sample, batch, Change(batch.plan.count, [Part(None, warp, source)]).inverse())
+        moved = self._moved(sample, batch, Change(batch.plan.count, [Part(source, warp)]).inverse())
         del moved["rotation"]
         moved.pop(PLACE, None)
         if before is not None:

@@ -154,16 +154,16 @@ class RandomMount(CameraDrawer):
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
         return {**super()._checked_draw(draw), **{key: draw[key] for key in _DEPTHS if key in draw}}
 
-    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
+    def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
         if _SHIFTS[0] not in self.ranges:
-            return super()._part(rows, source, draw)
+            return super()._part(source, draw)
         key = next((key for key in reversed(_DEPTHS) if key in draw), None)
         if key is None:
             raise ValueError(
                 f"{self._name}: draw must have the sample's depth for shift; got none. Call the augmentation with "
                 "the sample"
             )
-        part = super()._part(rows, source, {name: v for name, v in draw.items() if name not in (*_SHIFTS, key)})
+        part = super()._part(source, {name: v for name, v in draw.items() if name not in (*_SHIFTS, key)})
         shifts = [torch.as_tensor(draw[name], dtype=torch.float64) for name in _SHIFTS]
         shift = torch.stack(shifts, -1).expand(len(draw["apply"]), 3)
         warp = ShiftedWarp(source, part.target, part.warp.rotation, draw[key], _DEPTHS[key][1], shift, **self.options)

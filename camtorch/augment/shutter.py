@@ -49,7 +49,7 @@ class RandomShutter(Augmentation):
         super().__init__(ranges, min_filled=0, **options)  # only the rim may be empty
         self.direction: Direction = one_of(direction, DIRECTIONS, "direction", name)
 
-    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Any]) -> Part:
+    def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._like(source, self._values(source, draw))
         shutter = RollingShutter(values["readout"], torch.deg2rad(values["rates"]), direction=self.direction)
-        return Part(rows, ShutterWarp(source, source, target_shutter=shutter, **self.options), source)
+        return Part(source, ShutterWarp(source, source, target_shutter=shutter, **self.options))

@@ -39,8 +39,8 @@ class Always(Augmentation):
         super().__init__(camera=warp.source, fields=fields, min_filled=0)
         self.warp = warp
 
-    def _part(self, rows: list[int] | None, source: Camera, draw: Mapping[str, Tensor]) -> Part:
-        return Part(rows, self.warp, self.warp.source)
+    def _part(self, source: Camera, draw: Mapping[str, Tensor]) -> Part:
+        return Part(self.warp.source, self.warp)
 
 
 class Mover:

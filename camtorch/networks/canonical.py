@@ -187,7 +187,7 @@ class CanonicalCamera(SampleTransform):
             left, top = ((new - 1) / 2 - (old - 1) / 2 * scale for new, old in sides)
             matrix = torch.stack((scale, zero, left, zero, scale, top), -1).unflatten(-1, (2, 3))
             options = {**self.options, "antialias": self.antialias}
-            return Part(rows, AffineWarp(source, edited(source, matrix, size), matrix, None, **options), source)
+            return Part(source, AffineWarp(source, edited(source, matrix, size), matrix, None, **options))
 
         return by_kinds(count, camera, part)
 
