@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -42,12 +41,6 @@ class EditOptions(FlipOptions, total=False):
     """Options of edits and of what keeps its field of view; see `Augmentation`."""
 
     p: float
-
-
-class FilledOptions(EditOptions, total=False):
-    """Options of random cameras; see `Augmentation`."""
-
-    min_filled: float | None
 
 
 class Augmentation(SampleTransform):
@@ -152,16 +145,15 @@ class Augmentation(SampleTransform):
         self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
         """Draw as `draw` does, with another p and same_on_batch."""
-        numbers = self._numbers(count, p, same_on_batch, generator)
+        numbers = self._raw_draw(count, p, same_on_batch, generator)
         return {
             name: torch.as_tensor(value, dtype=torch.bool if name == "apply" else torch.float64)
             for name, value in numbers.items()
         }
 
-    def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
+    def _raw_draw(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
         """Return the draw as lists, arrays or tensors; see the function `draw`."""
-        values, self._calls.spans = draw(self.ranges, count, p, same_on_batch, generator, self._calls.spans)
-        return values
+        return draw(self.ranges, count, p, same_on_batch, generator)
 
     def with_boxes(self, draw: Mapping[str, Any], boxes: Tensor | Sequence[Tensor] | None) -> Mapping[str, Any]:
         """Return a draw with the boxes it needs of those of samples, (B, M, 4), or (M, 4) each, or None."""
@@ -190,9 +182,9 @@ class Augmentation(SampleTransform):
         if own is None or isinstance(own, (int, float)):
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
             raise ValueError(f"{self._name}: camera must be given; got {own}. Please {how}. {GUESS_CAMERA}")
-        return self._changed(alone(as_one(own)), self._checked_draw(draw))
+        return self._change_where_drawn(alone(as_one(own)), self._checked_draw(draw))
 
-    def _changed(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
+    def _change_where_drawn(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         """Return the change of a draw, computed on the CPU if the draw is there and the camera elsewhere, unlearnt."""
         twin = None if camera.intrinsics.is_cpu or not self.drawn_on_host else twin_of(camera)
         if twin is None or not all(getattr(value, "is_cpu", True) for value in draw.values()):
@@ -225,24 +217,25 @@ class Augmentation(SampleTransform):
                 if here:
                     source = group[here] if group.batch_shape and len(here) < len(rows) else group
                     own = [rows[n] for n in here]
-                    parts.append(replace(part(own, source) if moves else Part(source), rows=own))
+                    parts.append(part(own, source) if moves else Part(source))
+                    parts[-1].rows = own
         check_sizes((part.image_size for part in parts), self._name)
         return Change(count, parts, mixed=isinstance(camera, Mixed))
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
         """Check a draw, and return it as arrays unless it is recorded."""
         as_mapping(draw, "draw", self._name, "what draw() returns")
-        if missing := [name for name in ("apply", *self.ranges, *self.crops) if name not in draw]:
+        sizes = {**{name: interval.size for name, interval in self.ranges.items()}, **dict.fromkeys(self.crops, 4)}
+        if missing := [name for name in ("apply", *sizes) if name not in draw]:
             has = ", ".join(map(str, draw)) or "nothing"
             raise ValueError(f"{self._name}: draw must have {', '.join(missing)}; got {has}")
-        sizes = {**{name: interval.size for name, interval in self.ranges.items()}, **dict.fromkeys(self.crops, 4)}
-        given = {name: torch.as_tensor(draw[name]) for name in ("apply", *sizes)}
-        values: dict[str, Any] = {"apply": given["apply"] > 0.5, **{name: given[name] for name in sizes}}
+        values: dict[str, Any] = {name: torch.as_tensor(draw[name]) for name in ("apply", *sizes)}
+        values["apply"] = values["apply"] > 0.5
         if are_numbers(*values.values()):
-            values = {"apply": values["apply"].numpy(), **{name: given[name].double().numpy() for name in sizes}}
-        count = len(values["apply"])
+            values = {n: (value if n == "apply" else value.double()).numpy() for n, value in values.items()}
         for name, size in sizes.items():
-            value, shape = values[name], (count,) if size is None else (count, size)
+            value, count = values[name], len(values["apply"])
+            shape = (count,) if size is None else (count, size)
             if tuple(value.shape) != shape:
                 raise ValueError(f"{self._name}: draw[{name!r}] must be {shape}; got shape {tuple(value.shape)}")
             if isinstance(value, np.ndarray) and not np.isfinite(value).all():
@@ -256,9 +249,9 @@ class Augmentation(SampleTransform):
             factor, turned, found = enough(source, target, rotation, self.min_filled)
             target, rotation = scaled(target, factor), None if rotation is None else turned
             self._tell_of(source, lambda: target, factor, found)
-        return self._between(source, target, rotation, values)
+        return self._part_between(source, target, rotation, values)
 
-    def _between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
+    def _part_between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
         """Return the part whose samples go from a source to a target, with what of the values is beside the cameras."""
         return Part(source, Warp(source, target, rotation, **self.options))
 
@@ -301,7 +294,7 @@ class Augmentation(SampleTransform):
         if not are_known(camera.intrinsics):
             return
         self._calls.warned = True
-        values, _ = draw(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
+        values = draw(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
         with torch.no_grad():
             first = camera.detach()
             first = first[[0] * _TRIES] if first.batch_shape else first
@@ -360,12 +353,16 @@ class Augmentation(SampleTransform):
         draw: Mapping[str, Tensor] | None = None,
         generator: torch.Generator | None = None,
     ) -> tuple[Sample, Change]:
-        """Return a sample moved by one change, and the change; kinds: name -> kind, in addition to `fields`."""
+        """Return a sample moved by one change, and the change; kinds: name -> kind, in addition to `fields`.
+
+        `_batch` finds what moves and by which cameras, `_raw_draw` draws, `_change` makes the new cameras, those of one
+        model by a call of `_part`, and `_moved` moves the fields.
+        """
         batch = self._batch(sample, kinds=kinds)
         plan, camera, count = batch.plan, batch.camera, batch.plan.count
         if draw is None:
-            numbers = self._numbers(count, self.p, self.same_on_batch, generator)
-            change = self._changed(camera, self._of_sample(numbers, batch.rows))
+            numbers = self._raw_draw(count, self.p, self.same_on_batch, generator)
+            change = self._change_where_drawn(camera, self._of_sample(numbers, batch.rows))
         else:
             change = self.change(camera, self._of_sample(draw, batch.rows))
         if change.count != count:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch.augment.augmentation import Augmentation, FilledOptions
+from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.change import Drawn, Part
 from camtorch.augment.devices import twin_of
 from camtorch.augment.filling import enough, scaled
@@ -61,9 +61,10 @@ _AUTO = "focal", "centre", "distortion", "crop"
 _told: set[tuple[object, ...]] = set()
 
 
-class LensOptions(FilledOptions, total=False):
+class LensOptions(EditOptions, total=False):
     """Options that `RandomMount` and `RandomLens` have in common; see `RandomCamera`."""
 
+    min_filled: float | None
     chromatic: RangeLike | None
     vignetting: RangeLike | None
     cos4: RangeLike | None
@@ -76,7 +77,7 @@ class CameraDrawer(Augmentation):
     Args:
         like: see `RandomCamera`.
         given: name -> range, of those of `RandomCamera`.
-        chromatic, vignetting, cos4, image_size, options: see `RandomCamera`.
+        chromatic, vignetting, cos4, image_size, min_filled, options: see `RandomCamera`.
     """
 
     other_words: ClassVar[Mapping[str, str]] = {
@@ -97,9 +98,10 @@ class CameraDrawer(Augmentation):
         vignetting: RangeLike | None = None,
         cos4: RangeLike | None = None,
         image_size: Sequence[int] | None = None,
-        **options: Unpack[FilledOptions],
+        min_filled: float | None = None,
+        **options: Unpack[EditOptions],
     ):
-        super().__init__(**options)
+        super().__init__(min_filled=min_filled, **options)
         fov = given.get("fov")
         self.fov = "source" if isinstance(fov, str) and fov == "source" else None
         self._memo = Kept(8)
@@ -192,7 +194,7 @@ class CameraDrawer(Augmentation):
         return target, _joined(elements, source.intrinsics).unflatten(-1, (3, 3))
 
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
-        made = self._drawn(source, values)
+        made = self._native_draw(source, values)
         if made is not None:
             return made.target, made.rotation
         if type(self).new_camera is not CameraDrawer.new_camera:
@@ -201,7 +203,7 @@ class CameraDrawer(Augmentation):
         kind: dict[str, Any] = {"dtype": like.dtype, "device": like.device}  # at once: floats would be float32 first
         return self.new_camera(source, {name: torch.as_tensor(value, **kind) for name, value in values.items()})
 
-    def _drawn(self, source: Camera, values: Mapping[str, Any], share: float | None = None) -> Drawn | None:
+    def _native_draw(self, source: Camera, values: Mapping[str, Any], share: float | None = None) -> Drawn | None:
         """Return what compiled code makes of a draw; None where something is recorded, or it does not know a model."""
         if type(self).new_camera is not CameraDrawer.new_camera:
             return None
@@ -229,7 +231,7 @@ class CameraDrawer(Augmentation):
 
     def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._values(source, draw)
-        made = self._drawn(source, values, self.min_filled)
+        made = self._native_draw(source, values, self.min_filled)
         if made is None:
             return super()._part(source, draw)
         if self.min_filled and (min(made.found, default=1) < self.min_filled or max(made.factor, default=1) > 1):
@@ -239,9 +241,9 @@ class CameraDrawer(Augmentation):
         simple = simple and self.beside_the_camera.isdisjoint(self.ranges)
         if simple and not isinstance(source, PANORAMAS) and not isinstance(made.base, PANORAMAS):
             return Part(source, made)
-        return self._between(source, made.target, made.rotation, values)
+        return self._part_between(source, made.target, made.rotation, values)
 
-    def _between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
+    def _part_between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
         """Return the part with the effect of the lens on colours and light."""
         beside = self._like(source, {name: values[name] for name in self.beside_the_camera.intersection(values)})
         cameras, light = [target], None
@@ -286,7 +288,7 @@ class CameraDrawer(Augmentation):
         )
 
     def _size_of(self, source: Camera) -> tuple[int, int]:
-        return self.image_size or source.image_size or source.size_for(self._name)
+        return self.image_size or source.size_for(self._name)
 
     def _base(self, source: Camera, share: Any) -> tuple[Camera, Tensor, Tensor | None]:
         """Return whose lens the new cameras have, its intrinsics (*B, 4) before their images, and how far it reaches.

@@ -121,7 +121,7 @@ class Part:
             return None if start is None or end is None else (start, end, self.moves.rotation)
         return None if self.moves is None or self.shades or self.light is not None else between_of(self.warp)
 
-    def by(self, change: Callable[[Warp], Warp]) -> Part:
+    def with_warps(self, change: Callable[[Warp], Warp]) -> Part:
         """Return the part with each of its warps changed."""
         shades = None if self.shades is None else (change(self.shades[0]), change(self.shades[1]))
         return replace(self, moves=None if self.moves is None else change(self.warp), shades=shades)
@@ -138,7 +138,7 @@ class Part:
 
         camera, light = of(self.camera), self.light
         light = light if light is None or len(light) == 1 else light[index]
-        return replace(self.by(rows_of), rows=None, camera=camera, light=light)
+        return replace(self.with_warps(rows_of), rows=None, camera=camera, light=light)
 
     def then(self, second: Part) -> Part:
         """Return one part that does with one warp what this and another one of the same rows do in turn."""
@@ -148,7 +148,7 @@ class Part:
         if first is None:
             return replace(second, camera=self.camera)
         if not isinstance(last, Drawn) and last.keeps_lens:
-            return self.by(last.follow)
+            return self.with_warps(last.follow)
         turned, rotation = first.rotation, last.rotation  # (3, 3) or (B, 3, 3): the first turn, then the second
         if turned is not None and rotation is not None:
             dtype = torch.promote_types(turned.dtype, rotation.dtype)
@@ -160,7 +160,7 @@ class Part:
                 matrix = after(last.map, first.map)
                 return replace(self, moves=AffineWarp(self.camera, edited(self.camera, matrix, size), matrix, rotation))
             light = None if self.light is None else last(self.light, padding_mode="border")
-            moved = self.by(lambda warp: MirrorWarp(self.camera, edited(warp.target, last.map, size), rotation))
+            moved = self.with_warps(lambda warp: MirrorWarp(self.camera, edited(warp.target, last.map, size), rotation))
             return replace(moved, light=light)
         if self.shades is not None or self.light is not None:
             raise ValueError(
@@ -172,7 +172,7 @@ class Part:
             is_turn = rotation is None or (rotation.ndim == 2 and is_right(rotation))
             moves = replace(last, rotation=rotation, start=start, is_turn=is_turn)
             return replace(second, camera=self.camera, moves=moves)
-        moved = second.by(lambda warp: MirrorWarp(self.camera, warp.target, rotation))
+        moved = second.with_warps(lambda warp: MirrorWarp(self.camera, warp.target, rotation))
         return replace(moved, camera=self.camera)
 
 
@@ -267,11 +267,11 @@ class Change:
     @property
     def single_rotation(self) -> Tensor:
         """(3, 3): the rotation of a change of one sample, of its own memory."""
-        part = self.parts[0]
-        rotation = part.rotation
+        moves = self.parts[0].moves
+        rotation = None if moves is None else moves.rotation
         if self.gate is not None or (rotation is not None and rotation.ndim > 2):
             return self.rotation[0].clone()
-        return _eye(part.camera.intrinsics) if rotation is None else rotation.clone()
+        return _eye(self.parts[0].camera.intrinsics) if rotation is None else rotation.clone()
 
     @property
     def rotation(self) -> Tensor:
@@ -344,7 +344,9 @@ class Change:
             return make(warp.source, warp.target, warp.rotation, **options)
 
         parts = [
-            replace(p, moves=replace(p.moves, options=options)) if isinstance(p.moves, Drawn) else p.by(optioned)
+            replace(p, moves=replace(p.moves, options=options))
+            if isinstance(p.moves, Drawn)
+            else p.with_warps(optioned)
             for p in self.parts
         ]
         return Change(self.count, parts, mixed=self.mixed, gate=self.gate)

@@ -153,11 +153,11 @@ class Compose(Augmentation):
         """The augmentations in their order."""
         return cast("list[Augmentation]", list(self.augmentations))
 
-    def _numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
-        values: dict[str, Any] = draw({}, count, p, same_on_batch, generator)[0]
+    def _raw_draw(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
+        values: dict[str, Any] = draw({}, count, p, same_on_batch, generator)
         values["apply"] = values["apply"] if isinstance(values["apply"], Tensor) else np.asarray(values["apply"])
         for i, part in enumerate(self.parts):
-            own = part._numbers(count, part.p, same_on_batch or part.same_on_batch, generator)
+            own = part._raw_draw(count, part.p, same_on_batch or part.same_on_batch, generator)
             for key, value in own.items():
                 values[f"{i}.{key}"] = value.double() if isinstance(value, Tensor) else np.asarray(value, np.float64)
         return values

@@ -133,12 +133,6 @@ class Start:
         call.made.limits2, call.made.extent = (tensor.data_ptr() for tensor in kept)
         return kept
 
-    def _made(self, call: structs.Draws, kept: list[Any], rows: int) -> Native:
-        """Return the new cameras for compiled code."""
-        native = self._native
-        lenses = partial(self._lenses, kept[0], rows) if self._knows else lambda _: native.lenses
-        return Native.made(native, call.made, (call, kept, self), lenses)
-
     def drawn(self, values: Mapping[str, Any], base: Camera, options: Options) -> Drawn:
         """Return the new cameras, modules like `base`, of values (B,) and (B, size), or numbers and lists for one."""
         call, native, names = structs.Draws.from_buffer_copy(self._call), self._native, self.names
@@ -191,7 +185,8 @@ class Start:
             k = torch.from_numpy(numbers[13 * rows : (13 + call.count) * rows].reshape(*several, call.count))
         made = None
         if not left and (self._knows or not self._moves) and (self._knows or native.cameras == rows):
-            made = self._made(call, kept, rows)
+            lenses = partial(self._lenses, numbers, rows) if self._knows else lambda _: native.lenses
+            made = Native.made(native, call.made, (call, kept, self), lenses)
         elif is_one and not left:
             made = single_native(model_of(self.base), intrinsics, k)
         factor, found = filled[:rows], filled[rows:]

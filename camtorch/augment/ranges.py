@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from camtorch.evaluate.door import is_eager
 from camtorch.values.arguments import as_number, shown, warn
@@ -81,65 +80,42 @@ def as_range(
     return Range(low, high, size)
 
 
-class Spans:
-    """Ranges, ready to draw a value of each for some samples."""
-
-    def __init__(self, ranges: Mapping[str, Range], rows: int):
-        self.ranges = [*ranges.items()]  # values are drawn in their order
-        self.rows = rows
-        self._places: list[tuple[str, slice, tuple[int, int] | None]] = []
-        self._ends: list[tuple[float, float]] = []
-        for name, interval in ranges.items():
-            start, shape = len(self._ends), (rows, interval.size) if interval.size else None
-            self._ends += [(interval.low, interval.high - interval.low)] * (rows * (interval.size or 1))
-            self._places.append((name, slice(start, len(self._ends)), shape))
-        self.total: int = len(self._ends)
-        self.low, self.wide = np.array(self._ends, np.float64).reshape(-1, 2).T.copy()
-
-    def single(self, shares: Sequence[float]) -> dict[str, list[Any]]:
-        """Return the values of one row, (1,) or (1, size), at shares of their ranges."""
-        values = [low + wide * share for (low, wide), share in zip(self._ends, shares, strict=True)]
-        return {n: values[at] if shape is None else [values[at]] for n, at, shape in self._places}
-
-    def of(self, shares: Any) -> dict[str, Any]:
-        """Return the values (rows,) or (rows, size) at shares (total,) of their ranges, arrays or tensors."""
-        low: Any = self.low
-        wide: Any = self.wide
-        if isinstance(shares, Tensor):
-            low, wide = (torch.as_tensor(ends, device=shares.device) for ends in (low, wide))
-        values = low + wide * shares
-        return {n: values[at] if shape is None else values[at].reshape(shape) for n, at, shape in self._places}
-
-
 def draw(
-    ranges: Mapping[str, Range],
-    count: int,
-    p: float,
-    same: bool,
-    generator: torch.Generator | None,
-    spans: Spans | None = None,
-) -> tuple[dict[str, Any], Spans]:
-    """Return `apply` (count,), true with probability p, a value (count,) or (count, size) of every range; and `spans`.
+    ranges: Mapping[str, Range], count: int, p: float, same: bool, generator: torch.Generator | None
+) -> dict[str, Any]:
+    """Return `apply` (count,), true with probability p, and a value (count,) or (count, size) of every range.
 
     Lists of one sample and arrays of several take less time than tensors, which come where the generator is on another
     device, or code is compiled.
     """
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
-    rows = min(count, 1) if same else count
-    if spans is None or spans.rows != rows or spans.ranges != [*ranges.items()]:
-        spans = Spans(ranges, rows)
+    rows, total = min(count, 1) if same else count, 0
+    for interval in ranges.values():
+        total += rows * (interval.size or 1)
     device = "cpu" if generator is None else generator.device
     # the order is kornia's: the gate first
     gate = torch.rand(rows, generator=generator, dtype=torch.float32, device=device) < p if 0 < p < 1 else None
-    applied: Any
     # in float64, so that what is drawn is what every precision sees
-    shares: Any = torch.rand(spans.total, generator=generator, dtype=torch.float64, device=device)
+    shares: Any = torch.rand(total, generator=generator, dtype=torch.float64, device=device)
+    applied: Any
+    is_single = False
     if is_eager(shares):
-        if rows == count == 1:
-            return {"apply": [p >= 1] if gate is None else gate.tolist(), **spans.single(shares.tolist())}, spans
-        applied, shares = np.array([p >= 1] * rows, bool) if gate is None else gate.numpy(), shares.numpy()
+        is_single = rows == count == 1
+        shares = shares.tolist() if is_single else shares.numpy()
+        applied = [p >= 1] * rows if gate is None else gate.tolist()
+        applied = applied if is_single else np.array(applied, bool)
     else:
         applied = torch.full((rows,), p >= 1, device=device) if gate is None else gate
-    values = {"apply": applied, **spans.of(shares)}
-    return (values if rows == count else {name: value[[0] * count] for name, value in values.items()}), spans
+    values, start = {"apply": applied}, 0
+    for name, interval in ranges.items():  # values are drawn in their order
+        low, wide, end = interval.low, interval.high - interval.low, start + rows * (interval.size or 1)
+        if not is_single:
+            value = low + wide * shares[start:end]
+            values[name] = value.reshape(rows, interval.size) if interval.size else value
+        elif interval.size:
+            values[name] = [[low + wide * share for share in shares[start:end]]]
+        else:
+            values[name] = [low + wide * shares[start]]
+        start = end
+    return values if rows == count else {name: value[[0] * count] for name, value in values.items()}

@@ -41,7 +41,6 @@ from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess
 from camtorch.augment.place import PLACE
 from camtorch.augment.plan import Batch, Plan
-from camtorch.augment.ranges import Spans
 from camtorch.augment.sizes import check_cameras, check_one_size
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
@@ -116,7 +115,6 @@ class Calls:
     last: Change | None = None
     is_first: bool = False  # whether the last sample came without a rotation
     warned: bool = False
-    spans: Spans | None = None  # the ranges, ready to draw from
 
     def __init__(self) -> None:
         self.revision = object()  # another one whenever a public attribute is set: results are kept by it
