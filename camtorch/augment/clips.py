@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 
+from camtorch.augment.fields import OWN, kind_of
+from camtorch.augment.matrices import check_alike
+from camtorch.augment.place import PLACE
 from camtorch.cameras.camera import Camera
 
 
@@ -21,6 +24,30 @@ class Clips:
     shape: tuple[int, ...]  # (B, T), that of `image`
     image: str
     owner: str
+
+    @classmethod
+    def of(
+        cls, sample: Mapping[str, Any], fields: Mapping[str, str], tables: Iterable[str], owner: str
+    ) -> Clips | None:
+        """Return the clips of a sample, if an image has the dims (B, T, C, H, W).
+
+        fields: name -> kind, of other names. tables: names of the fields with tables of landmarks.
+        """
+        given = {name: value for name, value in sample.items() if name not in (*OWN, PLACE) and value is not None}
+        kinds = {name: kind_of(name, value, fields, owner) for name, value in given.items()}
+        dims = {name: getattr(value, "ndim", 0) for name, value in given.items()}
+        if (image := next((name for name, kind in kinds.items() if kind == "image" and dims[name] == 5), None)) is None:
+            return None
+        own = {name for name, kind in kinds.items() if kind not in (None, "K") and name != "rotation"}
+        whole = ["camera", "rotation", PLACE]
+        for name in (name for name, kind in kinds.items() if kind == "K"):
+            if dims[name] == 4:  # of each frame
+                check_alike(name, given[name], owner)
+                own.add(name)
+            else:
+                whole.append(name)
+        own |= {f"{name}_valid" for name in own} | {"image_valid", *tables}
+        return cls(sample, [name for name in given if name in own], whole, tuple(given[image].shape[:2]), image, owner)
 
     def frames(self, camera: Any) -> dict[str, Any]:
         """Return the sample as a batch of B * T frames, each with the `camera` of its clip, if any."""
@@ -46,13 +73,13 @@ class Clips:
         clips, frames = self.shape
         several = isinstance(value, Camera) and len(value.batch_shape) > 1
         if len(value) != clips or several:
-            got = tuple(value.batch_shape) if several else len(value)
-            flat = "ct.cat(list(camera))" if several else "camera, one for each"
-            hint = (
-                f". Images (B, N, C, H, W) of N cameras each go in flattened to (B N): {self.image}.flatten(0, 1) and "
-            )
-            hint += f"labels likewise, camera={flat}; results by .unflatten(0, {self.shape})"
-            hint = hint if name == "camera" else ""
+            got, hint = tuple(value.batch_shape) if several else len(value), ""
+            if name == "camera":
+                flat = "ct.cat(list(camera))" if several else "camera, one for each"
+                hint = (
+                    f". Images (B, N, C, H, W) of N cameras each go in flattened to (B N): {self.image}.flatten(0, 1) "
+                    f"and labels likewise, camera={flat}; results by .unflatten(0, {self.shape})"
+                )
             raise ValueError(f"{self.owner}: {name} must be of {clips} clips, as {self.image} is; got {got}{hint}")
         rows = [i for i in range(clips) for _ in range(frames)]
         return [value[i] for i in rows] if isinstance(value, (list, tuple)) else value[rows]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -18,6 +18,13 @@ from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.ranges import Range, draw
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import as_mapping
+
+T = TypeVar("T")
+
+
+def _of_parts(join: Callable[[Iterable[bool]], bool], name: str, meaning: str) -> Any:
+    """Return a property that joins an attribute of all parts."""
+    return property(lambda chain: join(getattr(part, name) for part in chain.parts), doc=meaning)
 
 
 class Compose(Augmentation):
@@ -102,8 +109,7 @@ class Compose(Augmentation):
     @property  # type: ignore[override]
     def ranges(self) -> Mapping[str, Range]:
         """The ranges of all parts, by the part's index and the name in it, as "0.yaw"; change those of a part."""
-        own = [{"apply": Range(0, 1), **part.ranges} for part in self.parts]
-        return MappingProxyType({f"{i}.{key}": value for i, ranges in enumerate(own) for key, value in ranges.items()})
+        return _by_place({"apply": Range(0, 1), **part.ranges} for part in self.parts)
 
     @ranges.setter
     def ranges(self, value: Mapping[str, Range]) -> None:
@@ -113,8 +119,7 @@ class Compose(Augmentation):
     @property
     def crops(self) -> Mapping[str, int]:  # type: ignore[override]
         """See `Augmentation`; those of all parts."""
-        found = {f"{i}.{key}": index for i, part in enumerate(self.parts) for key, index in part.crops.items()}
-        return MappingProxyType(found)
+        return _by_place(part.crops for part in self.parts)
 
     @property
     def mirroring(self) -> Mirroring | None:
@@ -127,26 +132,15 @@ class Compose(Augmentation):
             if part.mirroring is not None:
                 part.mirroring = value
 
-    @property
-    def needs_camera(self) -> bool:  # type: ignore[override]
-        """Whether a part does."""
-        return any(part.needs_camera for part in self.parts)
-
-    @property
-    def place(self) -> bool:  # type: ignore[override]
-        """Whether a part adds `crop_place`: that of the new image, seen from the first camera."""
-        return any(part.place for part in self.parts)
+    needs_camera = _of_parts(any, "needs_camera", "Whether a part does.")
+    place = _of_parts(any, "place", "Whether a part adds `crop_place`: of the new image, seen from the first camera.")
+    drawn_on_host = _of_parts(all, "drawn_on_host", "See `Augmentation`; whether all parts are.")
 
     @property
     def makes_pinholes(self) -> bool:  # type: ignore[override]
         """See `SampleTransform`; whether all parts do, from the last crop of a box on."""
         last = max((i for i, part in enumerate(self.parts) if part.crops and part.p == 1), default=0)
         return all(part.makes_pinholes for part in self.parts[last:])
-
-    @property
-    def drawn_on_host(self) -> bool:  # type: ignore[override]
-        """See `Augmentation`; whether all parts are."""
-        return all(part.drawn_on_host for part in self.parts)
 
     @property
     def parts(self) -> list[Augmentation]:
@@ -198,6 +192,11 @@ class Compose(Augmentation):
     def extra_repr(self) -> str:
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "antialias": self.antialias}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())
+
+
+def _by_place(parts: Iterable[Mapping[str, T]]) -> Mapping[str, T]:
+    """Return what parts have by name as one mapping, by the index of the part and the name, as "0.yaw"."""
+    return MappingProxyType({f"{i}.{key}": value for i, own in enumerate(parts) for key, value in own.items()})
 
 
 def _moved(change: Change, boxes: Any, camera: Camera) -> Tensor:

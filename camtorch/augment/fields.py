@@ -1,4 +1,4 @@
-"""The kinds of fields in a sample: how each is found by its name, checked, and moved."""
+"""The kinds of fields in a sample, a table: how each is found by its name, checked, and moved."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.augment import matrices
 from camtorch.augment.change import Change
+from camtorch.augment.matrices import NAMES, SHAPE, SIDES, check_matrix, matrix_hint, moved_matrix
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import may_look, pytree
 from camtorch.evaluate.tensors import known_false, known_true
@@ -23,10 +23,10 @@ from camtorch.values.arguments import as_coordinates, check_angles, check_boxes,
 from camtorch.values.dtypes import widen
 from camtorch.warp import arrays
 from camtorch.warp.samples import Label
+from camtorch.warp.sampling import Options, Sampler
 
 Named = dict[str, tuple[str, Any]]
 """Maps a name to (kind, tensor or list of tensors)."""
-
 
 FRONT_ENDS = (
     "For PIL images and torchvision write camtorch.augment.torchvision.Transform(augmentation); others are "
@@ -36,7 +36,6 @@ FRONT_ENDS = (
 KEEP = "keep"
 IMAGES = ("image", "mask", "depth", "distance")
 
-
 Move = Callable[[Change, Tensor, Mapping[str, float]], Any]
 
 
@@ -44,9 +43,13 @@ def _no_hint(name: str, value: Tensor, batched: bool) -> str:
     return ""
 
 
+def _no_check(value: Tensor, name: str, owner: str) -> None:
+    pass
+
+
 @dataclass(frozen=True)
 class Field:
-    """A kind of field: all that is asked of it. C moves some kinds of a single sample, `way`, as `move` would."""
+    """A kind of field: all that is asked of it."""
 
     dims: int  # the least number of dims of a single sample
     most_dims: int  # the most
@@ -54,12 +57,19 @@ class Field:
     shape: str  # in words, of a batch
     move: Move  # (change, batch, options) -> batch, or (batch, valid)
     _: KW_ONLY
+    sides: tuple[tuple[int, int], ...] = ()  # of matrices: what rows and columns may be
     decides: bool = False  # whether its number of dims distinguishes a batch from a sample
+    in_pixels: bool = False  # whether it is warned of numbers that hardly are pixels of the image
     hint: Callable[[str, Tensor, bool], str] = _no_hint  # (name, value, batched) -> what to do about a wrong shape
-    check: Callable[[str, Tensor, str], None] | None = (
-        None  # (name, value, owner): raises if values are of no such kind
-    )
-    way: Label | None = None
+    check: Callable[[Tensor, str, str], None] = _no_check  # (value, name, owner); raises if values are of no such kind
+    way: Label | Callable[[Options, float], Sampler] | None = None
+    """How the call of C for whole samples moves it, as `move` would: (options, mask_fill) -> sampler for images."""
+    apart: bool = False  # whether it needs each pixel's position, so that no such call serves its samples
+
+
+def _by(method: Callable[..., Any], *forms: Callable[[Tensor], Tensor]) -> Move:
+    """Return the move by a method of `Change`; forms: functions that read and write values of another form."""
+    return lambda change, value, options: method(change, value, *forms)
 
 
 def _planes(move: Move) -> Move:
@@ -72,6 +82,10 @@ def _planes(move: Move) -> Move:
     return of
 
 
+def _columns(matrix: Tensor) -> Tensor:
+    return matrix.mT
+
+
 def _pose(change: Change, pose: Tensor, options: Mapping[str, float]) -> Tensor:
     turned = change.rays(pose[..., :3, :], _columns, _columns)
     turned = torch.cat((turned[..., :3], change.positions(pose[..., :3, 3]).to(turned)[..., None]), -1)
@@ -79,20 +93,7 @@ def _pose(change: Change, pose: Tensor, options: Mapping[str, float]) -> Tensor:
     return torch.cat((top, pose[..., 3:, :].to(top)), -2)
 
 
-def _mirrored_head(change: Change, matrix: Tensor, options: Mapping[str, float]) -> Tensor:
-    """Return the columns (B, 3, n) of turned heads, whose sides a mirror exchanges without mirroring the pose."""
-    mirrored = change.mirrored
-    if mirrored is None:
-        return matrix
-    lateral = torch.arange(matrix.shape[-1], device=matrix.device) == options.get("lateral", 0)
-    return torch.where(mirrored.to(matrix.device)[:, None, None] & lateral, -matrix, matrix)
-
-
-def _columns(matrix: Tensor) -> Tensor:
-    return matrix.mT
-
-
-def _rotation_vector(change: Change, rvec: Tensor, options: Mapping[str, float]) -> Tensor:
+def _rvec(change: Change, rvec: Tensor, options: Mapping[str, float]) -> Tensor:
     if change.mirrored is None:
         return change.rays(rvec, lambda r: rotation_matrix(r).mT, lambda columns: rotation_vector(columns.mT))
     turned = _mirrored_head(change, change.rays(rotation_matrix(rvec), _columns, _columns), options)
@@ -101,15 +102,13 @@ def _rotation_vector(change: Change, rvec: Tensor, options: Mapping[str, float])
     return torch.where(still.unsqueeze(-1), rvec.to(turned), rotation_vector(turned))
 
 
-_MANY = 16
-
-
-def _positions(change: Change, points: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.positions(points)
-
-
-def _pixels(change: Change, pixels: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-    return change.points(pixels)
+def _mirrored_head(change: Change, matrix: Tensor, options: Mapping[str, float]) -> Tensor:
+    """Return the columns (B, 3, n) of turned heads, whose sides a mirror exchanges without mirroring the pose."""
+    mirrored = change.mirrored
+    if mirrored is None:
+        return matrix
+    lateral = torch.arange(matrix.shape[-1], device=matrix.device) == options["lateral"]
+    return torch.where(mirrored.to(matrix.device)[:, None, None] & lateral, -matrix, matrix)
 
 
 _PLACED = {"boxes_xywh": 0.0, "boxes_cxcywh": 0.5}  # boxes by place and sides: how far along them the place is
@@ -131,19 +130,16 @@ def _sided_boxes(kind: str, form: str) -> Field:
         low, high = corners.split(2, -1)
         return torch.cat((low + _PLACED[kind] * (high - low), high - low), -1)
 
-    def move(change: Change, boxes: Tensor, options: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-        return change.boxes(boxes, read, write)
-
-    def check_sides(name: str, value: Tensor, owner: str) -> None:
-        _check_form(kind, name, value, owner)
+    def check_sides(value: Tensor, name: str, owner: str) -> None:
+        _check_form(kind, value, name, owner)
         if not value.requires_grad and known_true((negative := (value[..., 2:] < 0).any(-1)).any()):
             raise ValueError(
-                f"{owner}: {name} must be {KINDS[kind].shape}, with sides of 0 or more; got "
-                f"{value[negative][0].tolist()}. Boxes x1, y1, x2, y2 are of the kind 'boxes'"
+                f"{owner}: {name} must be {shape}, with sides of 0 or more; got {value[negative][0].tolist()}. Boxes "
+                "x1, y1, x2, y2 are of the kind 'boxes'"
             )
 
-    read = functools.partial(as_corners, kind)
-    return Field(2, 2, (4,), f"(B, M, 4) pixels {form}", move, decides=True, hint=_boxes_hint, check=check_sides)
+    shape, move = f"(B, M, 4) pixels {form}", _by(Change.boxes, functools.partial(as_corners, kind), write)
+    return Field(2, 2, (4,), shape, move, decides=True, in_pixels=True, hint=_boxes_hint, check=check_sides)
 
 
 def _image_hint(name: str, value: Tensor, batched: bool) -> str:
@@ -193,7 +189,7 @@ def _pose_hint(name: str, value: Tensor, batched: bool) -> str:
     )
 
 
-def _check_form(kind: str, name: str, value: Tensor, owner: str) -> None:
+def _check_form(kind: str, value: Tensor, name: str, owner: str) -> None:
     form = getattr(getattr(value, "format", None), "value", None)  # of torchvision's BoundingBoxes
     if form not in (None, "XYXY" if kind == "boxes" else kind.removeprefix("boxes_").upper()):
         raise ValueError(
@@ -202,16 +198,12 @@ def _check_form(kind: str, name: str, value: Tensor, owner: str) -> None:
         )
 
 
-def _check_corners(name: str, value: Tensor, owner: str) -> None:
-    _check_form("boxes", name, value, owner)
+def _check_corners(value: Tensor, name: str, owner: str) -> None:
+    _check_form("boxes", value, name, owner)
     check_boxes(value, name, owner)
 
 
-def _check_rvec(name: str, value: Tensor, owner: str) -> None:
-    check_radians(value, name, owner)
-
-
-def _check_pose(name: str, value: Tensor, owner: str) -> None:
+def _check_pose(value: Tensor, name: str, owner: str) -> None:
     if not value.is_cpu or value.requires_grad:
         return
     rotations = value[..., :3, :3]
@@ -222,7 +214,7 @@ def _check_pose(name: str, value: Tensor, owner: str) -> None:
         check_rotation(rotations[wrong][:1], name, owner)
 
 
-def _check_pitch_yaw(name: str, value: Tensor, owner: str) -> None:
+def _check_pitch_yaw(value: Tensor, name: str, owner: str) -> None:
     if not value.is_cpu or value.requires_grad:
         return
     # with room for the rounding of half precision
@@ -235,100 +227,81 @@ def _check_pitch_yaw(name: str, value: Tensor, owner: str) -> None:
         )
 
 
-def _images(change: Change, images: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.images(images)
+def from_pitch_yaw(angles: Tensor) -> Tensor:
+    """Return unit gaze vectors (..., 3) of pitch and yaw (..., 2) in radians, as in MPIIGaze and ETH-XGaze.
+
+    Zero looks into the camera, along -z. Source: Zhang et al., ETH-XGaze, 2020, and its code.
+
+    Raises:
+        ValueError: If the shape is wrong, or plain angles are more than a turn and so may be degrees.
+    """
+    angles = as_coordinates(angles, "angles", 2, "from_pitch_yaw")
+    check_angles(angles, "from_pitch_yaw")
+    pitch, yaw = angles.unbind(-1)
+    return torch.stack((-pitch.cos() * yaw.sin(), -pitch.sin(), -pitch.cos() * yaw.cos()), -1)
 
 
-def _rays(change: Change, rays: Tensor, options: Mapping[str, float]) -> Tensor:
-    return change.rays(rays)
+def to_pitch_yaw(gaze: Tensor) -> Tensor:
+    """Return pitch and yaw (..., 2) in radians of gaze vectors (..., 3): pitch = asin(-y), yaw = atan2(-x, -z)."""
+    x, y, z = as_coordinates(gaze, "gaze", 3, "to_pitch_yaw").unbind(-1)
+    return torch.stack((torch.atan2(-y, torch.hypot(x, z)), torch.atan2(-x, -z)), -1)
 
 
+def _image_sampler(options: Options, mask_fill: float) -> Sampler:
+    return Sampler(options["mode"], options["padding_mode"], options["fill"])
+
+
+def _mask_sampler(options: Options, mask_fill: float) -> Sampler:
+    return Sampler("nearest", "zeros", (mask_fill,))
+
+
+_MANY = 16
+_points, _boxes, _positions, _rays = map(_by, (Change.points, Change.boxes, Change.positions, Change.rays))
+_pitch_yaw, _rotation = _by(Change.rays, from_pitch_yaw, to_pitch_yaw), _by(Change.rays, _columns, _columns)
+_labels = _planes(lambda change, masks, options: change.labels(masks, options["mask_fill"]))
 _DIRECTIONS = Field(1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", _rays, hint=_rays_hint, way="rays")
-_POSE = Field(
-    2,
-    2,
-    (4,),
-    "(B, 4, 4) or (B, 3, 4), camera from head",
-    _pose,
-    decides=True,
-    hint=_pose_hint,
-    check=_check_pose,
-    way="pose",
-)
-_MASKS = "(B, C, H, W) or (B, H, W)"
 _DEPTHS = "(B, 1, H, W) or (B, H, W), along"
+_KEYPOINTS = "(B, N, 2) or (B, F, N, 2) pixels x, y"
 _LANDMARKS = "(B, N, 2) pixels or (B, N, 3) points of the camera frame"
+_BOXES = "(B, M, 4) pixels x1, y1, x2, y2"
+_POSES = "(B, 4, 4) or (B, 3, 4), camera from head"
+_RVEC = "(B, 3), a rotation vector, camera from head"
+_TVEC = "(B, 3), a point of the camera frame"
+_GAZE = "(B, *N, 2) pitch and yaw of a gaze in radians"
+_POSE = Field(
+    2, 2, (4,), _POSES, _pose, sides=((4, 4), (3, 4)), decides=True, hint=_pose_hint, check=_check_pose, way="pose"
+)
 KINDS = {
-    "image": Field(3, 3, (), "(B, C, H, W)", _images, decides=True, hint=_image_hint),
-    "mask": Field(2, 3, (), _MASKS, _planes(lambda change, masks, given: change.labels(masks, given["mask_fill"]))),
-    "depth": Field(2, 3, (), f"{_DEPTHS} z", _planes(lambda change, depth, _: change.depth(depth))),
-    "distance": Field(2, 3, (), f"{_DEPTHS} the ray", _planes(lambda change, distance, _: change.distance(distance))),
+    "image": Field(3, 3, (), "(B, C, H, W)", _by(Change.images), decides=True, hint=_image_hint, way=_image_sampler),
+    "mask": Field(2, 3, (), "(B, C, H, W) or (B, H, W)", _labels, way=_mask_sampler),
+    "depth": Field(2, 3, (), f"{_DEPTHS} z", _planes(_by(Change.depth)), apart=True),
+    "distance": Field(2, 3, (), f"{_DEPTHS} the ray", _planes(_by(Change.distance)), apart=True),
     "keypoints": Field(
-        2,
-        3,
-        (2,),
-        "(B, N, 2) or (B, F, N, 2) pixels x, y",
-        _pixels,
-        decides=True,
-        hint=_keypoints_hint,
-        way="pixels",
+        2, 3, (2,), _KEYPOINTS, _points, decides=True, in_pixels=True, hint=_keypoints_hint, way="pixels"
     ),
-    "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _pixels, decides=True, way="pixels"),
+    "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _points, decides=True, way="pixels"),
     "boxes": Field(
-        2,
-        2,
-        (4,),
-        "(B, M, 4) pixels x1, y1, x2, y2",
-        lambda change, boxes, _: change.boxes(boxes),
-        decides=True,
-        hint=_boxes_hint,
-        check=_check_corners,
-        way="boxes",
+        2, 2, (4,), _BOXES, _boxes, decides=True, in_pixels=True, hint=_boxes_hint, check=_check_corners, way="boxes"
     ),
     "boxes_xywh": _sided_boxes("boxes_xywh", "x, y, width, height"),
     "boxes_cxcywh": _sided_boxes("boxes_cxcywh", "x and y of the centre, width, height"),
-    "landmarks": Field(2, 3, (2, 3), _LANDMARKS, _pixels, decides=True, hint=_landmarks_hint),
+    "landmarks": Field(2, 3, (2, 3), _LANDMARKS, _points, decides=True, in_pixels=True, hint=_landmarks_hint),
     "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _positions, hint=_column_hint, way="rays"),
     "gaze": _DIRECTIONS,
     "directions": _DIRECTIONS,
-    "pitch_yaw": Field(
-        1,
-        _MANY,
-        (2,),
-        "(B, *N, 2) pitch and yaw of a gaze in radians",
-        lambda change, angles, _: change.rays(angles, from_pitch_yaw, to_pitch_yaw),
-        check=_check_pitch_yaw,
-    ),
+    "pitch_yaw": Field(1, _MANY, (2,), _GAZE, _pitch_yaw, check=_check_pitch_yaw),
     "head_pose": _POSE,
     "pose": _POSE,
     "rvec": Field(
-        1,
-        1,
-        (3,),
-        "(B, 3), a rotation vector, camera from head",
-        _rotation_vector,
-        decides=True,
-        hint=_column_hint,
-        check=_check_rvec,
-        way="rotation vectors",
+        1, 1, (3,), _RVEC, _rvec, decides=True, hint=_column_hint, check=check_radians, way="rotation vectors"
     ),
-    "tvec": Field(
-        1, 1, (3,), "(B, 3), a point of the camera frame", _positions, decides=True, hint=_column_hint, way="rays"
-    ),
-    "rotation": Field(
-        2,
-        2,
-        (3,),
-        "(B, 3, 3), turned so far",
-        lambda change, turn, _: change.rays(turn, _columns, _columns),
-        hint=_column_hint,
-        way="columns",
-    ),
-    "K": Field(2, 2, (3, 4), matrices.SHAPE, matrices.moved, decides=True, hint=matrices.hint, check=matrices.check),
+    "tvec": Field(1, 1, (3,), _TVEC, _positions, decides=True, hint=_column_hint, way="rays"),
+    "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", _rotation, hint=_column_hint, way="columns"),
+    "K": Field(2, 2, (3, 4), SHAPE, moved_matrix, sides=SIDES, decides=True, hint=matrix_hint, check=check_matrix),
 }
 BOXES = "boxes", *_PLACED
 ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
-ALIASES |= {name: "K" for name in matrices.NAMES if name != "K"}
+ALIASES |= {name: "K" for name in NAMES if name != "K"}
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
 
 
@@ -462,35 +435,27 @@ def _hint(name: str) -> str:
 
 def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> None:
     """Raise a ValueError if a kind does not take this shape."""
-    field = KINDS[kind]
-    dims = value.ndim - batched
-    if not field.dims <= dims <= field.most_dims or (field.last and value.shape[-1] not in field.last):
+    field, shape = KINDS[kind], tuple(value.shape)
+    fits = field.dims <= len(shape) - batched <= field.most_dims and (not field.last or shape[-1] in field.last)
+    if not fits or (field.sides and shape[-2:] not in field.sides):
         what = field.shape if batched else field.shape.replace("(B, ", "(")
         hint = f". {hint}" if (hint := field.hint(name, value, batched)) else _hint(name)
-        raise ValueError(f"{owner}: {name} must be {what}; got shape {tuple(value.shape)}{hint}")
-    rows = (3, 4) if kind in ("head_pose", "pose") else value.shape[-1:]
-    if kind in ("head_pose", "pose", "K") and value.shape[-2] not in rows:
-        raise ValueError(f"{owner}: {name} must be {field.shape}; got shape {tuple(value.shape)}")
-
-
-def check_values(kind: str, name: str, value: Tensor, owner: str) -> None:
-    """Raise a ValueError if plain labels are not in the form of their kind; NaN is accepted."""
-    if (check := KINDS[kind].check) is not None:
-        check(name, value, owner)
+        raise ValueError(f"{owner}: {name} must be {what}; got shape {shape}{hint}")
 
 
 def warn_of_numbers(kind: str, name: str, value: Tensor, flags: Any, size: Sequence[int], owner: str) -> None:
     """Warn of labels that seem to be parts of an image's sides, of an image of another size, or to mean "not seen"."""
-    if kind not in (*BOXES, "keypoints", "landmarks") or not value.is_cpu:
+    if not KINDS[kind].in_pixels or not value.is_cpu:
         return
-    pixels = value if kind in BOXES else value[..., :2]
-    if value.shape[-1] == 2 and _are_off(value, flags, size):
+    are_points = value.shape[-1] == 2
+    pixels = value[..., :2] if value.shape[-1] == 3 else value
+    if are_points and _are_off(value, flags, size):
         warn(
             f"{owner}: {name} must be pixels of the image, of (height, width) = {tuple(size)}; got most of them far "
             "outside of it, as of an image of another size. Scale x by (x + 0.5) * width / old width - 0.5, and so y. "
             f"For points that are not seen pass NaN, or {name}_valid=..., a flag for each"
         )
-    if value.shape[-1] == 2 and flags is None and known_true((pixels == -1).all(-1).any()):
+    if are_points and flags is None and known_true((pixels == -1).all(-1).any()):
         warn(
             f"{owner}: {name} has points at (-1, -1), which move as any pixels. If these are not seen, pass NaN, or "
             f"{name}_valid=..., a flag for each"
@@ -498,7 +463,7 @@ def warn_of_numbers(kind: str, name: str, value: Tensor, flags: Any, size: Seque
     if value.numel() <= 3 or not known_true((pixels == pixels.clamp(0, 1)).all() & (pixels % 1 != 0).any()):
         return
     if value.shape[-1] != 3:
-        form = KINDS[kind].shape.partition(") ")[2] if kind in BOXES else "pixels"
+        form = "pixels" if are_points else KINDS[kind].shape.partition(") ")[2]
         places = " from x and y" if kind in _PLACED else ""
         warn(
             f"{owner}: {name} must be {form}; got values within [0, 1], as parts of an image's sides. Multiply them by "
@@ -546,23 +511,3 @@ def in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
         most = torch.finfo(dtype).max
         values = values.clamp(-most, most)
     return values.to(dtype)
-
-
-def from_pitch_yaw(angles: Tensor) -> Tensor:
-    """Return unit gaze vectors (..., 3) of pitch and yaw (..., 2) in radians, as in MPIIGaze and ETH-XGaze.
-
-    Zero looks into the camera, along -z. Source: Zhang et al., ETH-XGaze, 2020, and its code.
-
-    Raises:
-        ValueError: If the shape is wrong, or plain angles are more than a turn and so may be degrees.
-    """
-    angles = as_coordinates(angles, "angles", 2, "from_pitch_yaw")
-    check_angles(angles, "from_pitch_yaw")
-    pitch, yaw = angles.unbind(-1)
-    return torch.stack((-pitch.cos() * yaw.sin(), -pitch.sin(), -pitch.cos() * yaw.cos()), -1)
-
-
-def to_pitch_yaw(gaze: Tensor) -> Tensor:
-    """Return pitch and yaw (..., 2) in radians of gaze vectors (..., 3): pitch = asin(-y), yaw = atan2(-x, -z)."""
-    x, y, z = as_coordinates(gaze, "gaze", 3, "to_pitch_yaw").unbind(-1)
-    return torch.stack((torch.atan2(-y, torch.hypot(x, z)), torch.atan2(-x, -z)), -1)

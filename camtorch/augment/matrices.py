@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 NAMES = "K", "intrinsics", "camera_matrix"
 SHAPE = "(B, 3, 3) or (B, 4, 4), [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of the image"
+SIDES = (3, 3), (4, 4)
 _SKEW = 1e-6  # parts of the focal length: a skew up to there is none
 _ALIKE = 1e-5  # relative: matrices that were float32 on the way are the same ones
 _told: set[str] = set()  # who warned of a matrix of another image in this process
@@ -37,17 +38,14 @@ class Guess(float):
     @classmethod
     def instead(cls, camera: Any, owner: str) -> Any:
         """Return a number as a `Guess`, and all else as it is."""
-        is_number = isinstance(camera, numbers.Real) and not isinstance(camera, (bool, Guess))
-        return cls.of(camera, owner) if is_number else camera
-
-    @classmethod
-    def of(cls, degrees: float, owner: str) -> Guess:
-        if not 0 < degrees < 180:
+        if not isinstance(camera, numbers.Real) or isinstance(camera, (bool, Guess)):
+            return camera
+        if not 0 < (degrees := float(camera)) < 180:
             raise ValueError(
                 f"{owner}: camera must be a Camera, or degrees across of a guessed pinhole, above 0 and below 180; "
-                f"got {degrees!r}"
+                f"got {camera!r}"
             )
-        check_degrees(degrees, degrees, owner)
+        check_degrees(degrees, camera, owner)
         return cls(degrees)
 
     def camera(self, size: tuple[int, int]) -> Pinhole:
@@ -73,9 +71,9 @@ def _tell() -> None:
     )
 
 
-def hint(name: str, value: Tensor, batched: bool) -> str:
+def matrix_hint(name: str, value: Tensor, batched: bool) -> str:
     """Return what to do about a wrong shape of a matrix K."""
-    if value.shape[-2:] in ((3, 3), (4, 4)) and batched and value.ndim == 2:
+    if value.shape[-2:] in SIDES and batched and value.ndim == 2:
         return f"One that all samples share goes in as {name}.expand(B, -1, -1)"
     if value.shape[-2:] == (3, 4):
         return f"Of [K | 0] pass K, {name}[..., :3]"
@@ -84,7 +82,7 @@ def hint(name: str, value: Tensor, batched: bool) -> str:
     return f"If it is something else, fields={{{name!r}: 'keep'}} keeps it unchanged"
 
 
-def check(name: str, value: Tensor, owner: str) -> None:
+def check_matrix(value: Tensor, name: str, owner: str) -> None:
     """Raise a ValueError if matrices (..., 3, 3) or (..., 4, 4) are not those of pinhole cameras without skew."""
     given = value.detach()
     wanted = torch.eye(given.shape[-1], dtype=given.dtype, device=given.device)
@@ -115,9 +113,11 @@ def camera_of(name: str, matrix: Tensor | list[Tensor], size: tuple[int, int], o
     """Return the camera of images of a size (height, width) with a matrix, a batch or a list; gradients reach it."""
     rows = matrix if isinstance(matrix, list) else [matrix]
     for row in rows:
-        if row.shape[-2:] not in ((3, 3), (4, 4)) or row.ndim > 3 - isinstance(matrix, list):
-            raise ValueError(f"{owner}: {name} must be {SHAPE}; got shape {tuple(row.shape)}. {hint(name, row, False)}")
-        check(name, row, owner)
+        if row.shape[-2:] not in SIDES or row.ndim > 3 - isinstance(matrix, list):
+            raise ValueError(
+                f"{owner}: {name} must be {SHAPE}; got shape {tuple(row.shape)}. {matrix_hint(name, row, False)}"
+            )
+        check_matrix(row, name, owner)
     numbers = torch.stack([numbers_of(row) for row in rows]) if isinstance(matrix, list) else numbers_of(matrix)
     if owner not in _told and (off := off_centre(numbers, size)):
         _told.add(owner)
@@ -172,7 +172,7 @@ def check_targets(fields: Mapping[str, str], change: Change, owner: str) -> None
         refuse(next(name for name, kind in fields.items() if kind == "K"), owner, type(lens).__name__)
 
 
-def moved(change: Change, matrix: Tensor, options: Mapping[str, float]) -> Tensor:
+def moved_matrix(change: Change, matrix: Tensor, options: Mapping[str, float]) -> Tensor:
     """Return the matrices (B, 3, 3) or (B, 4, 4) of the cameras after a change; the other entries stay."""
     result = widen(matrix).clone()
     new = change.target.intrinsics.to(result)

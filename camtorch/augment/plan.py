@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -18,6 +19,8 @@ from camtorch.values.threads import thread_count
 from camtorch.warp.samples import Label, call_for
 from camtorch.warp.sampling import Options, Sampler
 
+Moved = tuple[Tensor, Tensor | None]
+"""A field of a sample as it comes out, and which of it is valid, if it has validity."""
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
 
 
@@ -29,80 +32,69 @@ class Plan:
     batched: bool
     count: int
     masks: Sequence[str]  # names of the masks of validity that come out: "image_valid" and so on
+    mask_fill: float
     calls: Kept | None  # the names of the fields that one call of C moves, and the call; None if a graph may want them
 
     def rows(self, value: Any) -> Any:
         """Return a value with a dim B; a list has one already."""
         return value if self.batched or isinstance(value, list) else value.unsqueeze(0)
 
-    def together(
-        self, change: Change, values: Mapping[str, Any], mask_fill: float
-    ) -> dict[str, tuple[Tensor, Tensor | None]]:
-        """Move by one call of C: images, pixels, and for a single sample boxes and rays; also return their validity.
+    def together(self, change: Change, values: Mapping[str, Any]) -> dict[str, Moved]:
+        """Move by one call of C: images, pixels, and for a single sample boxes and rays.
 
-        The other fields, and all of them where no call serves, are not in the result.
+        The other fields, and all of them if no call serves, are not in the result.
         """
-        part = change.parts[0]
-        moves = part.moves
-        if moves is None or part.rows is not None or change.gate is not None or not self.count or self.calls is None:
+        part, is_single = change.parts[0], change.count == 1
+        moves, calls = part.moves, self.calls
+        if calls is None or moves is None or part.rows is not None or change.gate is not None or not self.count:
             return {}
         if (between := part.between()) is None:
             return {}
         source, target, rotation = between
-        most = max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9)
-        if most != self.count:
+        if max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != self.count:
             return {}
-        options, is_single = moves.options, change.count == 1
-        turns = is_single and isinstance(moves, Drawn)  # labels of a single sample, by new cameras
-        is_turn = isinstance(moves, Drawn) and turns and moves.is_turn
-        sizes = part.camera.size_for("Warp"), part.image_size
-        settings = sizes, source.dtype, *options.values(), mask_fill, turns, is_turn, thread_count()
-        known = self.calls.entry((), settings)
-        if known is None:
-            ways = self._ways(values, options, mask_fill, source.dtype if turns else None, is_turn, is_single)
+        options, sizes = moves.options, (part.camera.size_for("Warp"), part.image_size)
+        turns = source.dtype if is_single and isinstance(moves, Drawn) else None
+        is_turn = isinstance(moves, Drawn) and is_single and moves.is_turn
+        settings = sizes, source.dtype, turns, is_turn, thread_count(), *options.values()
+        if (known := calls.entry((), settings)) is None:
+            ways = self._ways(values, options, turns, is_turn)
             chosen = [values[name] for name in ways]
             call = call_for(sizes, source.dtype, options, chosen, [*ways.values()], self.batched) if ways else None
-            names = self.calls((), settings, lambda: (list(ways), call))[0]
+            names = calls((), settings, lambda: ([*ways], call))[0]
         else:
             names, call = known[2]
-        given = [values[name] for name in names]
-        moved = None if call is None else call(source, target, rotation, given)
-        results: dict[str, tuple[Tensor, Tensor | None]] = {}
-        for name, value, result in zip(names, given, moved or (), strict=bool(moved)):
+        if call is None or (moved := call(source, target, rotation, [values[name] for name in names])) is None:
+            return {}
+        results: dict[str, Moved] = {}
+        for name, result in zip(names, moved, strict=True):
             if result is not None:
-                rows, valid = result
-                results[name] = rows if rows.dtype == value.dtype else in_range(rows, value.dtype), valid
+                (rows, valid), dtype = result, values[name].dtype
+                results[name] = rows if rows.dtype == dtype else in_range(rows, dtype), valid
         return results
 
     def _ways(
-        self,
-        values: Mapping[str, Any],
-        options: Options,
-        mask_fill: float,
-        dtype: torch.dtype | None,
-        is_turn: bool,
-        is_single: bool,
+        self, values: Mapping[str, Any], options: Options, turns: torch.dtype | None, is_turn: bool
     ) -> dict[str, Sampler | Label]:
         """Return how each field moves that one call of C takes.
 
-        dtype: of labels of a single sample that turn, or None. is_turn: whether the rotation does not mirror.
+        turns: the dtype in which labels of a single sample turn; None if they do not turn by the call. is_turn: whether
+        the rotation does not mirror.
         """
-        mode, padding_mode, fill = options["mode"], options["padding_mode"], options["fill"]
         ways: dict[str, Sampler | Label] = {}
         for name, kind in self.fields.items():
             value = values[name]
-            if kind in ("depth", "distance") or isinstance(value, list):  # these need the positions again
+            if KINDS[kind].apart or isinstance(value, list):
                 return {}
-            dims = value.ndim - self.batched
-            if dims > KINDS[kind].most_dims:  # frames
+            if value.ndim - self.batched > KINDS[kind].most_dims:  # frames
                 continue
-            if kind == "image" and len(fill) in (1, value.shape[-3]):
-                ways[name] = Sampler(mode, padding_mode, fill)
-            elif kind == "mask":
-                ways[name] = Sampler("nearest", "zeros", (mask_fill,))
-            elif (way := field_of(kind, value).way) == "pixels":
-                ways |= {name: way} if is_single or value.numel() < _MANY_PIXELS else {}
-            elif way is None or value.dtype != dtype or not are_numbers(value):
+            way = field_of(kind, value).way
+            if callable(way):
+                sampler = way(options, self.mask_fill)
+                ways |= {name: sampler} if len(sampler.fill) == 1 or len(sampler.fill) == value.shape[-3] else {}
+            elif way == "pixels":
+                ways |= {name: way} if self.count == 1 or value.numel() < _MANY_PIXELS else {}
+            elif way is None or value.dtype != turns or not are_numbers(value):
                 continue
             elif way == "boxes" or (value.is_contiguous() and (way == "rays" or is_turn)):
                 ways[name] = way
@@ -120,3 +112,17 @@ class Batch(NamedTuple):
     def rows(self) -> dict[str, tuple[str, Any]]:
         """Return name -> kind and value, with a dim B."""
         return {name: (kind, self.plan.rows(self.values[name])) for name, kind in self.plan.fields.items()}
+
+
+def move(change: Change, kind: str, value: Tensor, options: Mapping[str, float]) -> Moved:
+    """Return rows (B, ...) of a kind moved by a change; those of one sample may have more dims, of frames."""
+    if lead := value.shape[1 : value.ndim - KINDS[kind].most_dims]:
+        frames = Change(math.prod(lead), [replace(part, rows=None) for part in change.parts])
+        result, valid = move(frames, kind, value.flatten(0, len(lead)), options)
+        return result.reshape(1, *lead, *result.shape[1:]), valid if valid is None else valid.reshape(
+            1, *lead, *valid.shape[1:]
+        )
+    result = field_of(kind, value).move(change, value, options)
+    result, valid = result if isinstance(result, tuple) else (result, None)
+    # geometry is computed in float32 at least; what came in half precision goes out in it
+    return in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid

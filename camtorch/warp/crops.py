@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import keeps_graph
@@ -15,7 +16,7 @@ from camtorch.evaluate.kept import Kept
 from camtorch.values.arguments import Numbers, as_values
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.grid import Sampling
-from camtorch.warp.sampling import Fill, Mode, PaddingMode, as_options, render
+from camtorch.warp.sampling import Fill, Mode, PaddingMode, TolerantOptions, as_options, render
 from camtorch.warp.warp import Warp, checked
 
 
@@ -39,21 +40,9 @@ class CropsWarp(Warp):
     `points[:, None].expand(-1, F, -1, -1)`.
     """
 
-    def __init__(
-        self,
-        source: Camera,
-        target: Camera,
-        rotation: Tensor,
-        *,
-        mode: Mode = "bilinear",
-        padding_mode: PaddingMode = "zeros",
-        fill: Fill = 0.0,
-        antialias: bool = False,
-        tolerance: float | None = None,
-    ):
-        """Make it of valid cameras, single, (B,) or (B, F), and rotations (B, F, 3, 3)."""
-        options = as_options("Warp", mode, padding_mode, fill, antialias, tolerance)
-        self.set_up(source, target, options, rotation.shape[:-2])
+    def __init__(self, source: Camera, target: Camera, rotation: Tensor, **options: Unpack[TolerantOptions]):
+        """Make it of valid cameras, single, (B,) or (B, F), and rotations (B, F, 3, 3); options as of `Warp`."""
+        self.set_up(source, target, as_options("Warp", **options), rotation.shape[:-2])
         self.turned_by(rotation)
         self._rows = Kept()
 

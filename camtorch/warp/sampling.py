@@ -356,7 +356,12 @@ class TolerantOptions(WarpOptions, total=False):
 
 
 def as_options(
-    owner: str, mode: str, padding_mode: str, fill: Fill, antialias: bool | None, tolerance: float | None
+    owner: str,
+    mode: str = "bilinear",
+    padding_mode: str = "zeros",
+    fill: Fill = 0.0,
+    antialias: bool | None = False,
+    tolerance: float | None = None,
 ) -> Options:
     """Return the checked options of a `Warp`, by name."""
     tolerance = None if tolerance is None else as_number(tolerance, "tolerance", owner)

@@ -1,0 +1,97 @@
+"""A sample as it is read: its fields by their kinds, each checked, and the form of it all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from threading import get_ident
+from typing import Any
+
+from torch import Tensor
+
+from camtorch.augment.fields import KINDS, OWN, Named, as_tensor, check, kind_of, warn_of_numbers
+from camtorch.augment.place import PLACE
+from camtorch.cameras.camera import Camera
+from camtorch.evaluate.tensors import are_free
+from camtorch.values.dtypes import check_averaged
+
+
+def by_kind(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str, single: bool = False) -> Named:
+    """Return the fields that move; fields: name -> kind, of other names."""
+    named: Named = {}
+    for name, value in sample.items():
+        if name in OWN or name == PLACE or value is None:
+            continue
+        if (kind := kind_of(name, value, fields, owner, single)) is None:
+            continue
+        if isinstance(value, (list, tuple)):
+            named[name] = kind, [as_tensor(item, f"{name}[{i}]", kind, owner) for i, item in enumerate(value)]
+        else:
+            named[name] = kind, as_tensor(value, name, kind, owner)
+    return named
+
+
+def moving(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str) -> Named:
+    """Return the fields that move, at least one; see `by_kind`."""
+    if not (named := by_kind(sample, fields, owner)):
+        raise ValueError(f"{owner}: the sample must have a field that moves; got none of {', '.join(KINDS)}")
+    return named
+
+
+def check_fields(
+    sample: Mapping[str, Any], named: Named, batched: bool, has_frames: bool, owner: str, mode: str | None
+) -> int:
+    """Check shapes and values of the fields of a sample, and return of how many samples all are.
+
+    has_frames: whether values of a single sample may have leading dims. mode: how images are sampled; None: values may
+    be bad.
+    """
+    images = [value for kind, value in named.values() if kind == "image"]
+    size = images[0][0].shape[-2:] if images and len(images[0]) else ()
+    count = -1
+    for name, (kind, value) in named.items():
+        several, field = isinstance(value, list), KINDS[kind]
+        for i, item in enumerate(value if several else [value]):
+            which, more = f"{name}[{i}]" if several else name, item.ndim - field.most_dims
+            frame = item.new_empty(item.shape[more:]) if more > 0 and has_frames else item
+            check(kind, which, frame, batched and not several, owner)
+            if mode is None:
+                continue
+            field.check(item, which, owner)
+            if kind == "image":
+                check_averaged(item, mode, which, owner)
+            if len(size) == 2:
+                flags = sample.get(f"{name}_valid")
+                if several and flags is not None:
+                    flags = flags[i] if i < len(flags) else ()
+                warn_of_numbers(kind, which, item, flags, size, owner)
+        own = len(value) if batched or several else 1
+        count = own if count < 0 else count
+        if own != count:
+            raise ValueError(f"{owner}: {name} must be of {count} samples, as other fields; got {own}")
+    return count
+
+
+def form_of(
+    sample: Mapping[str, Any], camera: object, fields: Mapping[str, str], revision: object
+) -> tuple[Any, ...] | None:
+    """Return all that a plan depends on; None if a field is no tensor or number, or the camera a `Mixed`.
+
+    revision: of the transform, another one for other options.
+    """
+    if not isinstance(camera, Camera) or camera.is_mixed:
+        return None
+    is_free = are_free(*[value for value in sample.values() if isinstance(value, Tensor)])
+    if not is_free and not are_free():
+        return None
+    intrinsics, distortion = camera.intrinsics, camera.distortion
+    # each thread has calls of its own
+    parts: list[Any] = [revision, get_ident(), type(sample), type(camera), camera.image_size]
+    parts += intrinsics.shape, intrinsics.dtype, intrinsics.device, distortion.shape
+    for name, value in sample.items():
+        if isinstance(value, Tensor):
+            parts += name, type(value), value.shape, value.stride(), value.dtype, value.device
+        elif value is None or isinstance(value, (str, int, float, Camera)):
+            parts += name, type(value)
+        else:
+            return None
+    return *parts, is_free, *fields.items()
