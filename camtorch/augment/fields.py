@@ -256,7 +256,7 @@ def _mask_sampler(options: Options, mask_fill: float) -> Sampler:
 
 
 _MANY = 16
-_points, _boxes, _positions, _rays = map(_by, (Change.points, Change.boxes, Change.positions, Change.rays))
+_points, _boxes, _positions, _rays = _by(Change.points), _by(Change.boxes), _by(Change.positions), _by(Change.rays)
 _pitch_yaw, _rotation = _by(Change.rays, from_pitch_yaw, to_pitch_yaw), _by(Change.rays, _columns, _columns)
 _labels = _planes(lambda change, masks, options: change.labels(masks, options["mask_fill"]))
 _DIRECTIONS = Field(1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", _rays, hint=_rays_hint, way="rays")

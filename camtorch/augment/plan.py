@@ -64,7 +64,7 @@ class Plan:
             names = calls((), settings, lambda: ([*ways], call))[0]
         else:
             names, call = known[2]
-        if call is None or (moved := call(source, target, rotation, [values[name] for name in names])) is None:
+        if call is None or (moved := call(source, target, rotation, [*map(values.__getitem__, names)])) is None:
             return {}
         results: dict[str, Moved] = {}
         for name, result in zip(names, moved, strict=True):

@@ -20,8 +20,7 @@ from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess, camera_of, check_agrees, check_targets, refuse
 from camtorch.augment.plan import Batch, Plan, move
 from camtorch.augment.ranges import Spans
-from camtorch.augment.reading import by_kind, check_fields, form_of, moving
-from camtorch.augment.sizes import check_cameras, check_one_size
+from camtorch.augment.reading import by_kind, check_cameras, check_fields, check_one_size, form_of, moving
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept
@@ -134,10 +133,17 @@ class SampleOptions(TypedDict, total=False):
 
 
 class SampleTransform(KeepsCamera, nn.Module):
-    """Moves all fields of a sample by one change of cameras. See `Augmentation` and `FaceNormalizer`."""
+    """The base of what moves all fields of a sample by one change of cameras, as `Augmentation` does."""
 
     other_words: ClassVar[Mapping[str, str]] = {}
     """Words that people try as keywords -> the keyword, for the hint of an error."""
+    needs_camera: bool = True
+    """Whether samples, or it, need a camera; edits do not."""
+    makes_pinholes: bool = True
+    """Whether a pinhole camera becomes one, as far as that is known before a draw."""
+    mirroring: Mirroring | None = None
+    """What changes places in a mirror; None if it never mirrors."""
+    _warps_decide: bool = False  # whether `antialias` is None
 
     def __new__(cls, *args: Any, **options: Any) -> Self:
         """Check the names of arguments, which Python would only call unexpected."""
@@ -181,8 +187,6 @@ class SampleTransform(KeepsCamera, nn.Module):
         super().__setstate__(state)  # type: ignore[no-untyped-call]
         self._calls = Calls()  # which states before 0.5 lack
 
-    _warps_decide: bool = False  # whether `antialias` is None
-
     @property
     def antialias(self) -> bool | None:
         """The option of that name; None if each warp decides."""
@@ -192,11 +196,6 @@ class SampleTransform(KeepsCamera, nn.Module):
     def antialias(self, value: bool | None) -> None:
         self._warps_decide = value is None
         self.options["antialias"] = value is not None and as_flag(value, "antialias", self._name)
-
-    mirroring: Mirroring | None = None  # what changes places where an augmentation mirrors; None: it never does
-    needs_camera: bool = True  # whether samples, or it, need a camera; edits do not
-
-    makes_pinholes: bool = True  # whether a pinhole camera becomes one, as far as that is known before a draw
 
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
         """Return the sample and the keyword arguments as one dict."""
@@ -336,7 +335,9 @@ class SampleTransform(KeepsCamera, nn.Module):
                 valid = valid if batched or valid is None else valid.squeeze(0)
             if valid is not None:
                 flags = sample.get(f"{name}_valid")
-                moved[f"{name}_valid"] = valid if flags is None else both(f"{name}_valid", valid, flags, self._name)
+                moved[f"{name}_valid"] = (
+                    valid if flags is None else still_valid(f"{name}_valid", valid, flags, self._name)
+                )
         for key in plan.masks:
             if (seen := self._seen(key, sample.get(key), plan, change)) is not None:
                 moved[key] = seen.contiguous() if batched else seen[0].contiguous()
@@ -393,7 +394,7 @@ def camera_of_images(named: Named, guess: Guess | None, is_needed: bool, owner: 
     )
 
 
-def both(name: str, valid: Any, given: Any, owner: str) -> Any:
+def still_valid(name: str, valid: Any, given: Any, owner: str) -> Any:
     """Return the flags that come out, invalid if those given are; any number but zero is valid, as in COCO."""
     many = isinstance(valid, list)
     now, before = valid if many else [valid], [torch.as_tensor(b) != 0 for b in (given if many else [given])]
