@@ -18,7 +18,7 @@ from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.matrices import Guess
 from camtorch.augment.place import PLACE, put_place
 from camtorch.augment.ranges import Range, draw
-from camtorch.augment.reading import by_kind
+from camtorch.augment.reading import moving
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
@@ -341,7 +341,7 @@ class Augmentation(SampleTransform):
             frames = clips.frames(alone(own) if isinstance(own, Camera) else own)
             drawn = self.drawn(clips.shape[0], self.p, self.same_on_batch, generator) if draw is None else draw
             each = clips.shape[1]  # of what a draw needs of a sample, that of the first frame counts
-            first = {n: (kind, value[::each]) for n, (kind, value) in by_kind(frames, self.fields, self._name).items()}
+            first = {n: (kind, value[::each]) for n, (kind, value) in moving(frames, self.fields, self._name).items()}
             whole = self._of_sample(drawn, lambda: first)
             draw = {n: clips.repeated(value, f"draw[{n!r}]") for n, value in whole.items()}
             return clips.restored(self.forward(frames, draw=draw))

@@ -38,14 +38,16 @@ class Clips:
         dims = {name: getattr(value, "ndim", 0) for name, value in given.items()}
         if (image := next((name for name, kind in kinds.items() if kind == "image" and dims[name] == 5), None)) is None:
             return None
-        own = {name for name, kind in kinds.items() if kind not in (None, "K") and name != "rotation"}
-        whole = ["camera", "rotation", PLACE]
-        for name in (name for name, kind in kinds.items() if kind == "K"):
-            if dims[name] == 4:  # of each frame
+        whole = [
+            "camera",
+            "rotation",
+            PLACE,
+            *(name for name, kind in kinds.items() if kind == "K" and dims[name] != 4),
+        ]
+        own = {name for name, kind in kinds.items() if kind is not None and name not in whole}
+        for name, kind in kinds.items():
+            if kind == "K" and name in own:  # of each frame
                 check_alike(name, given[name], owner)
-                own.add(name)
-            else:
-                whole.append(name)
         own |= {f"{name}_valid" for name in own} | {"image_valid", *tables}
         return cls(sample, [name for name in given if name in own], whole, tuple(given[image].shape[:2]), image, owner)
 

@@ -433,7 +433,7 @@ def _hint(name: str) -> str:
     return "" if name in KINDS else f". If it is something else, fields={{{name!r}: '{KEEP}'}} keeps it unchanged"
 
 
-def check(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> None:
+def check_shape(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> None:
     """Raise a ValueError if a kind does not take this shape."""
     field, shape = KINDS[kind], tuple(value.shape)
     fits = field.dims <= len(shape) - batched <= field.most_dims and (not field.last or shape[-1] in field.last)

@@ -115,7 +115,7 @@ class Batch(NamedTuple):
 
 
 def move(change: Change, kind: str, value: Tensor, options: Mapping[str, float]) -> Moved:
-    """Return rows (B, ...) of a kind moved by a change; those of one sample may have more dims, of frames."""
+    """Return values (B, ...) of a kind moved by a change; those of one sample may have more dims, of frames."""
     if lead := value.shape[1 : value.ndim - KINDS[kind].most_dims]:
         frames = Change(math.prod(lead), [replace(part, rows=None) for part in change.parts])
         result, valid = move(frames, kind, value.flatten(0, len(lead)), options)

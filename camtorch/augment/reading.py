@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from camtorch.augment.fields import IMAGES, KINDS, OWN, Named, as_tensor, check, kind_of, warn_of_numbers
+from camtorch.augment.fields import IMAGES, KINDS, OWN, Named, as_tensor, check_shape, kind_of, warn_of_numbers
 from camtorch.augment.place import PLACE
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import are_free
@@ -16,24 +16,20 @@ from camtorch.values.dtypes import check_averaged
 from camtorch.warp.warp import as_sized
 
 
-def by_kind(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str, single: bool = False) -> Named:
-    """Return the fields that move; fields: name -> kind, of other names."""
+def moving(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str, single: bool = False) -> Named:
+    """Return the fields that move, at least one.
+
+    fields: name -> kind, of other names. single: whether the sample is known to be without a dim B.
+    """
     named: Named = {}
     for name, value in sample.items():
-        if name in OWN or name == PLACE or value is None:
-            continue
-        if (kind := kind_of(name, value, fields, owner, single)) is None:
-            continue
-        if isinstance(value, (list, tuple)):
+        stays = name in OWN or name == PLACE or value is None
+        kind = None if stays else kind_of(name, value, fields, owner, single)
+        if kind is not None and isinstance(value, (list, tuple)):
             named[name] = kind, [as_tensor(item, f"{name}[{i}]", kind, owner) for i, item in enumerate(value)]
-        else:
+        elif kind is not None:
             named[name] = kind, as_tensor(value, name, kind, owner)
-    return named
-
-
-def moving(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str) -> Named:
-    """Return the fields that move, at least one; see `by_kind`."""
-    if not (named := by_kind(sample, fields, owner)):
+    if not named:
         raise ValueError(f"{owner}: the sample must have a field that moves; got none of {', '.join(KINDS)}")
     return named
 
@@ -41,10 +37,10 @@ def moving(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str) -> 
 def check_fields(
     sample: Mapping[str, Any], named: Named, batched: bool, has_frames: bool, owner: str, mode: str | None
 ) -> int:
-    """Check shapes and values of the fields of a sample, and return of how many samples all are.
+    """Raise if the shape or the values of a field are wrong; return the number of samples.
 
-    has_frames: whether values of a single sample may have leading dims. mode: how images are sampled; None: values may
-    be bad.
+    has_frames: whether values of a single sample may have leading dims. mode: how images are sampled; None if values
+    may be bad, as predictions are.
     """
     images = [value for kind, value in named.values() if kind == "image"]
     size = images[0][0].shape[-2:] if images and len(images[0]) else ()
@@ -54,7 +50,7 @@ def check_fields(
         for i, item in enumerate(value if several else [value]):
             which, more = f"{name}[{i}]" if several else name, item.ndim - field.most_dims
             frame = item.new_empty(item.shape[more:]) if more > 0 and has_frames else item
-            check(kind, which, frame, batched and not several, owner)
+            check_shape(kind, which, frame, batched and not several, owner)
             if mode is None:
                 continue
             field.check(item, which, owner)
@@ -127,7 +123,7 @@ def form_of(
 ) -> tuple[Any, ...] | None:
     """Return all that a plan depends on; None if a field is no tensor or number, or the camera a `Mixed`.
 
-    revision: of the transform, another one for other options.
+    revision: that of the transform, which changes with its options.
     """
     if not isinstance(camera, Camera) or camera.is_mixed:
         return None

@@ -1,4 +1,4 @@
-"""A sample: the kinds of fields that it may have, how each is checked, and how all move by one change of cameras."""
+"""The base of what moves samples: it reads one, keeps a plan for its form, and moves all fields by one change."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess, camera_of, check_agrees, check_targets, refuse
 from camtorch.augment.plan import Batch, Plan, move
 from camtorch.augment.ranges import Spans
-from camtorch.augment.reading import by_kind, check_cameras, check_fields, check_one_size, form_of, moving
+from camtorch.augment.reading import check_cameras, check_fields, check_one_size, form_of, moving
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept
@@ -56,7 +56,7 @@ class Unknown(Pinhole):
 
 
 class KeepsCamera:
-    """Keeps a copy of a `camera`, and of one that is `like` others, whenever it is set; the copy does not learn."""
+    """The base of what keeps a copy of each `camera`, or `like`, that is set on it; the copy does not learn."""
 
     _name: str = ""  # in errors; empty: that of the class
 
@@ -80,7 +80,7 @@ class KeepsCamera:
 
 
 class Calls:
-    """What calls leave in a transform. Copies and pickles begin anew: caches know a used one by its bytes."""
+    """The state that calls leave in a transform. Copies and pickles begin anew, with the bytes of an unused one."""
 
     last: Change | None = None
     is_first: bool = False  # whether the last sample came without a rotation
@@ -245,7 +245,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         named, owner = moving(sample, fields, self._name), self._name
         batched = not isinstance(sample, Single) and is_batch(named, camera)
         if not batched:
-            by_kind(sample, fields, owner, single=True)  # raises for whole numbers of more than a row
+            moving(sample, fields, owner, single=True)  # raises for whole numbers of more than a row
         mode = None if predicted else self.options["mode"]
         count = check_fields(sample, named, batched, isinstance(sample, Frames), owner, mode)
         check_cameras(camera, count, named, owner)
@@ -297,7 +297,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         if clips := self._clips(sample, kinds):
             return clips.restored(self.moved_by(change, clips.frames(None), kinds, predicted))
         if change.count == 1:
-            own = by_kind(sample, {**self.fields, **(kinds or {})}, self._name).values()
+            own = moving(sample, {**self.fields, **(kinds or {})}, self._name).values()
             sizes = {len(value) if isinstance(value, (list, tuple)) else value.shape[:1].numel() for _, value in own}
             if sizes != {1} and all(kind != "image" for kind, _ in own):
                 sample = Single(sample)  # labels of several faces, without the image that tells
