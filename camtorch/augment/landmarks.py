@@ -108,7 +108,8 @@ def as_table(value: TableLike, owner: str) -> Table:
 # numbers of points that hardly anything else has
 _FACES = {n: " or ".join(repr(k) for k, v in LANDMARKS.items() if len(v) == n) for n in (68, 98, 106, 468, 478)}
 _told: set[int] = set()  # numbers of points that this process has warned about
-_HOLD = ("keypoints", "landmarks", "points")  # kinds of fields that may be landmarks
+_PIXELS = "keypoints", "landmarks"  # kinds of fields that are landmarks
+_HOLD = *_PIXELS, "points"  # and that may be some
 _LEFT, _RIGHT = "_left", "_right"
 
 
@@ -142,7 +143,7 @@ class Mirroring:
         """Return the order of `count` landmarks of a field in a mirror, or None; a path may precede its name."""
         table = self._named.get(name.rpartition("/")[2]) if self._named is not None else self._one
         if table is None or count == 0:
-            meant = _FACES.get(count) if self._named is None and kind in _HOLD[:2] else None
+            meant = _FACES.get(count) if self._named is None and kind in _PIXELS else None
             if meant is not None and count not in _told:
                 _told.add(count)
                 warn(
@@ -214,7 +215,7 @@ class Mirroring:
                     f"{type(value).__name__}"
                 )
             moved[name] = [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
-        pixels = [one for kind, value in named.values() for one in _items(value) if kind in ("keypoints", "landmarks")]
+        pixels = [one for kind, value in named.values() for one in _items(value) if kind in _PIXELS]
         faces = {tuple(one.shape[1:3]) for one in pixels if one.ndim == 4}  # (F, N)
         keys = {key for name in (*named, *kept) for key in (name, f"{name}_valid") if key in moved}
         single = {key for key in keys if not (batched or isinstance(moved[key], list))}

@@ -107,7 +107,7 @@ class Batch(NamedTuple):
     plan: Plan
     values: Mapping[str, Any]  # as they came, where these are tensors; without a dim B if the plan is not `batched`
     camera: Camera
-    checked: bool  # whether the values were looked at, and not their form alone
+    checked: bool  # whether values need no check any more, or may be bad; those of a known form are not checked yet
 
     def rows(self) -> dict[str, tuple[str, Any]]:
         """Return name -> kind and value, with a dim B."""
