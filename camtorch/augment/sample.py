@@ -19,7 +19,6 @@ from camtorch.augment.keywords import check_arguments
 from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess, camera_of, check_agrees, check_targets, refuse
 from camtorch.augment.plan import Batch, Plan, move
-from camtorch.augment.ranges import Spans
 from camtorch.augment.reading import check_cameras, check_fields, check_one_size, form_of, moving
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
@@ -233,8 +232,8 @@ class SampleTransform(KeepsCamera, nn.Module):
             batch = Batch(known[2], sample, alone(camera), predicted)
         else:
             batch = self._new_batch(sample, camera, fields, predicted)
-            is_there = form is not None and batch.camera.intrinsics.device == camera.intrinsics.device
-            if is_there and all(v is sample[n] for n, v in batch.values.items()):
+            is_kept = all(v is sample[n] for n, v in batch.values.items())
+            if form is not None and is_kept and batch.camera.intrinsics.device == camera.intrinsics.device:
                 self._calls.plans((), form, lambda: batch.plan)
         if "K" in batch.plan.fields.values():
             self._check_matrices(batch, sample)
