@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch.augment.change import Change, Part, alone, as_one, by_kinds, check_sizes
+from camtorch.augment.change import Change, Part, by_kinds, check_sizes, one_or_batch
 from camtorch.augment.devices import Elsewhere, remember_camera, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, Named, as_corners
 from camtorch.augment.filling import enough, filled, scaled
@@ -183,7 +183,7 @@ class Augmentation(SampleTransform):
         if own is None or isinstance(own, (int, float)):
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
             raise ValueError(f"{self._name}: camera must be given; got {own}. Please {how}. {GUESS_CAMERA}")
-        return self._change_where_drawn(alone(as_one(own)), self._checked_draw(draw))
+        return self._change_where_drawn(one_or_batch(own), self._checked_draw(draw))
 
     def _change_where_drawn(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         """Return the change of a draw, computed on the CPU if the draw is there and the camera elsewhere, unlearnt."""
@@ -211,7 +211,7 @@ class Augmentation(SampleTransform):
             if not isinstance(camera, Mixed):
                 return Change(count, [self._part(camera, draw)], gate=gate)
             return by_kinds(count, camera, part, gate)
-        parts, camera = [], alone(camera)
+        parts, camera = [], one_or_batch(camera)
         for rows, group in camera.groups if isinstance(camera, Mixed) else [(list(range(count)), camera)]:
             for moves in (True, False):
                 here = [n for n, row in enumerate(rows) if chosen[row] == moves]
@@ -338,7 +338,7 @@ class Augmentation(SampleTransform):
         if clips := self._clips(sample):
             own = sample.get("camera")
             own = self.camera if own is None else own
-            frames = clips.frames(alone(own) if isinstance(own, Camera) else own)
+            frames = clips.frames(one_or_batch(own) if isinstance(own, Camera) else own)
             drawn = self.drawn(clips.shape[0], self.p, self.same_on_batch, generator) if draw is None else draw
             each = clips.shape[1]  # of what a draw needs of a sample, that of the first frame counts
             first = {n: (kind, value[::each]) for n, (kind, value) in moving(frames, self.fields, self._name).items()}

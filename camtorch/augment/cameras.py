@@ -12,7 +12,7 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
-from camtorch.augment.change import Drawn, Part
+from camtorch.augment.change import LazyWarp, Part
 from camtorch.augment.devices import twin_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.jitter import jittered
@@ -194,7 +194,7 @@ class CameraDrawer(Augmentation):
         return target, _joined(elements, source.intrinsics).unflatten(-1, (3, 3))
 
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
-        made = self._native_draw(source, values)
+        made = self._lazy_warp(source, values)
         if made is not None:
             return made.target, made.rotation
         if type(self).new_camera is not CameraDrawer.new_camera:
@@ -203,8 +203,8 @@ class CameraDrawer(Augmentation):
         kind: dict[str, Any] = {"dtype": like.dtype, "device": like.device}  # at once: floats would be float32 first
         return self.new_camera(source, {name: torch.as_tensor(value, **kind) for name, value in values.items()})
 
-    def _native_draw(self, source: Camera, values: Mapping[str, Any], share: float | None = None) -> Drawn | None:
-        """Return what compiled code makes of a draw; None where something is recorded, or it does not know a model."""
+    def _lazy_warp(self, source: Camera, values: Mapping[str, Any], share: float | None = None) -> LazyWarp | None:
+        """Return the warp of a draw by compiled code; None where something is recorded, or it does not know a model."""
         if type(self).new_camera is not CameraDrawer.new_camera:
             return None
         like = self._like_for(source)
@@ -227,11 +227,11 @@ class CameraDrawer(Augmentation):
             known = self._memo.entry(tensors, key)
             found = self._memo(tensors, key, start) if known is None else known[2]
         own_lens = like is None and not self._is_real
-        return None if found is None else found.drawn(values, source if own_lens else found.base, self.options)
+        return None if found is None else found.warp(values, source if own_lens else found.base, self.options)
 
     def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._values(source, draw)
-        made = self._native_draw(source, values, self.min_filled)
+        made = self._lazy_warp(source, values, self.min_filled)
         if made is None:
             return super()._part(source, draw)
         if self.min_filled and (min(made.found, default=1) < self.min_filled or max(made.factor, default=1) > 1):

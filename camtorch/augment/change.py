@@ -41,8 +41,8 @@ def as_is(camera: Camera, rows: Tensor) -> Tensor:
 
 
 @dataclass(slots=True)
-class Drawn:
-    """A warp to new cameras of which compiled code wrote the numbers; modules are made when somebody asks for them."""
+class LazyWarp:
+    """A warp to cameras of which compiled code wrote the numbers; both become modules when somebody asks for them."""
 
     base: Camera  # of whose model the new cameras are
     intrinsics: Tensor  # (4,) of one, or (B, 4)
@@ -90,7 +90,7 @@ class Part:
     """Rows of a batch that move by one warp, or stay as they are."""
 
     camera: Camera  # before the change; the warp's source
-    moves: Warp | Drawn | None = None  # by what; None: nothing happens to these rows
+    moves: Warp | LazyWarp | None = None  # by what; None: nothing happens to these rows
     shades: tuple[Warp, Warp] | None = None  # how red and blue move, where they do not move as green
     light: Tensor | None = None  # (n or 1, 1, H', W'): what the lens lets through
     rows: list[int] | None = None  # which samples of the batch, or None for all
@@ -98,7 +98,7 @@ class Part:
     @property
     def warp(self) -> Warp:
         assert self.moves is not None
-        return self.moves.warp(self.camera) if isinstance(self.moves, Drawn) else self.moves
+        return self.moves.warp(self.camera) if isinstance(self.moves, LazyWarp) else self.moves
 
     @property
     def target(self) -> Camera:
@@ -112,11 +112,11 @@ class Part:
     @property
     def image_size(self) -> tuple[int, int]:
         """(height, width) after the change."""
-        return self.moves.image_size if isinstance(self.moves, Drawn) else self.target.size_for("Warp")
+        return self.moves.image_size if isinstance(self.moves, LazyWarp) else self.target.size_for("Warp")
 
     def between(self) -> tuple[Native, Native, Tensor | None] | None:
         """Return both cameras and the rotation for compiled code; None if it takes more than that."""
-        if isinstance(self.moves, Drawn):
+        if isinstance(self.moves, LazyWarp):
             start, end = self.moves.start, self.moves.native
             return None if start is None or end is None else (start, end, self.moves.rotation)
         return None if self.moves is None or self.shades or self.light is not None else between_of(self.warp)
@@ -125,6 +125,19 @@ class Part:
         """Return the part with each of its warps changed."""
         shades = None if self.shades is None else (change(self.shades[0]), change(self.shades[1]))
         return replace(self, moves=None if self.moves is None else change(self.warp), shades=shades)
+
+    def with_options(self, options: Options) -> Part:
+        """Return the part with its warps made anew by other options."""
+
+        def optioned(warp: Warp) -> Warp:
+            if isinstance(warp, MirrorWarp) and warp.options == options:
+                return warp
+            make = warp.between if isinstance(warp, MirrorWarp) else MirrorWarp
+            return make(warp.source, warp.target, warp.rotation, **options)
+
+        if isinstance(self.moves, LazyWarp):
+            return replace(self, moves=replace(self.moves, options=options))
+        return self.with_warps(optioned)
 
     def take(self, index: list[int]) -> Part:
         """Return these rows of the part as a part of its own."""
@@ -147,7 +160,7 @@ class Part:
             return self
         if first is None:
             return replace(second, camera=self.camera)
-        if not isinstance(last, Drawn) and last.keeps_lens:
+        if not isinstance(last, LazyWarp) and last.keeps_lens:
             return self.with_warps(last.follow)
         turned, rotation = first.rotation, last.rotation  # (3, 3) or (B, 3, 3): the first turn, then the second
         if turned is not None and rotation is not None:
@@ -167,8 +180,8 @@ class Part:
                 "Compose: chromatic and vignetting must be those of the last lens of a chain; got an earlier one, "
                 "whose colours or light would be seen through another lens"
             )
-        if isinstance(last, Drawn) and not self.camera.batch_shape:
-            start = first.start if isinstance(first, Drawn) else _single(self.camera)
+        if isinstance(last, LazyWarp) and not self.camera.batch_shape:
+            start = first.start if isinstance(first, LazyWarp) else _single(self.camera)
             is_turn = rotation is None or (rotation.ndim == 2 and is_right(rotation))
             moves = replace(last, rotation=rotation, start=start, is_turn=is_turn)
             return replace(second, camera=self.camera, moves=moves)
@@ -239,8 +252,6 @@ class Change:
 
     def _in_order(self, pieces: Sequence[Tensor]) -> Tensor:
         """Return rows, given part by part, as a batch of all samples."""
-        if self._order is None:
-            return pieces[0]
         if pieces[0].ndim > 2:  # of images: the rest keeps its shape
             check_sizes((piece.shape[-2], piece.shape[-1]) for piece in pieces)
         return torch.cat(tuple(pieces))[self._order]
@@ -252,15 +263,15 @@ class Change:
     @property
     def single(self) -> Camera:
         """Return the camera after, of a change of one sample; its own, not that of the change."""
-        if isinstance(moves := self.parts[0].moves, Drawn):
+        if isinstance(moves := self.parts[0].moves, LazyWarp):
             return moves.new_target()
-        return (self.target[0] if self.gate is not None else alone(self.parts[0].target)).clone()
+        return (self.target[0] if self.gate is not None else one_or_batch(self.parts[0].target)).clone()
 
     @property
     def several(self) -> Camera:
         """Return the cameras after, a batch of all samples; their own, not those of the change."""
         moves = self.parts[0].moves
-        if isinstance(moves, Drawn) and self.parts[0].rows is None and not self.mixed:
+        if isinstance(moves, LazyWarp) and self.parts[0].rows is None and not self.mixed:
             return moves.new_target(None if moves.intrinsics.ndim == 2 else self.count)
         return self.target.clone()
 
@@ -284,7 +295,7 @@ class Change:
     @property
     def mirrored(self) -> Tensor | None:
         """(count,) bool: which samples are seen in a mirror; None if none is."""
-        turns = [part.rotation if isinstance(part.moves, (Drawn, MirrorWarp)) else None for part in self.parts]
+        turns = [part.rotation if isinstance(part.moves, (LazyWarp, MirrorWarp)) else None for part in self.parts]
         if all(turn is None for turn in turns):
             return None
         x, y, z = self._turns(turns).unbind(-2)
@@ -296,11 +307,11 @@ class Change:
         turns = []
         for part, rotation, n in zip(self.parts, rotations, self._counts, strict=True):
             turns.append((_eye(part.camera.intrinsics) if rotation is None else rotation).expand(n, 3, 3))
-        return self._in_order(turns)
+        return turns[0] if self._order is None else self._in_order(turns)
 
     def leads_to(self, camera: Camera | Sequence[Camera], rotation: Tensor | None = None) -> bool:
         """Whether these may be the cameras after, by number, intrinsics and rotation, where one may look."""
-        pairs = [(self.target.intrinsics.reshape(-1, 4), as_one(camera).intrinsics.reshape(-1, 4), 1e-8)]
+        pairs = [(self.target.intrinsics.reshape(-1, 4), one_or_batch(camera).intrinsics.reshape(-1, 4), 1e-8)]
         pairs += [] if rotation is None else [(self.rotation, rotation.reshape(-1, 3, 3), _HALF)]
         return all(
             ours.shape == its.shape
@@ -336,19 +347,7 @@ class Change:
 
     def with_options(self, options: Options) -> Change:
         """Return the change with its warps made anew by other options."""
-
-        def optioned(warp: Warp) -> Warp:
-            if isinstance(warp, MirrorWarp) and warp.options == options:
-                return warp
-            make = warp.between if isinstance(warp, MirrorWarp) else MirrorWarp
-            return make(warp.source, warp.target, warp.rotation, **options)
-
-        parts = [
-            replace(p, moves=replace(p.moves, options=options))
-            if isinstance(p.moves, Drawn)
-            else p.with_warps(optioned)
-            for p in self.parts
-        ]
+        parts = [part.with_options(options) for part in self.parts]
         return Change(self.count, parts, mixed=self.mixed, gate=self.gate)
 
     def row(self, i: int) -> Change:
@@ -527,20 +526,16 @@ def by_kinds(
     count: int, camera: Camera, part: Callable[[list[int] | None, Camera], Part], gate: Tensor | None = None
 ) -> Change:
     """Return the change of samples by cameras: `part` takes the rows, None for all, and the cameras of each kind."""
-    camera = alone(camera)
+    camera = one_or_batch(camera)
     if not isinstance(camera, Mixed):
         return Change(count, [part(None, camera)], gate=gate)
     parts = [replace(part(rows, source), rows=rows) for rows, source in camera.groups]
     return Change(count, parts, mixed=True, gate=gate)
 
 
-def as_one(camera: Camera | Sequence[Camera]) -> Camera:
-    """Return one camera or a batch as it is, and a list of single ones as a batch."""
-    return camera if isinstance(camera, Camera) else Mixed(camera)
-
-
-def alone(camera: Camera) -> Camera:
-    """Return a batch of one as the camera that it holds, which serves any number of samples."""
+def one_or_batch(camera: Camera | Sequence[Camera]) -> Camera:
+    """Return the one camera of all samples, or the batch of theirs; a list becomes a batch."""
+    camera = camera if isinstance(camera, Camera) else Mixed(camera)
     return camera[0] if camera.batch_shape == (1,) else camera
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch.augment.change import Change, Part, alone
+from camtorch.augment.change import Change, Part, one_or_batch
 from camtorch.augment.matrices import Guess
 from camtorch.augment.place import PLACE
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
@@ -98,7 +98,7 @@ class FaceNormalizer(SampleTransform):
         """
         device, dtype = camera.intrinsics.device, torch.promote_types(camera.intrinsics.dtype, torch.float32)
         check_rotation(head_rotation, "the head's rotation", self._name)
-        camera = alone(camera)
+        camera = one_or_batch(camera)
         centre, across = face_centre.to(device, dtype), head_rotation[..., 0].to(device, dtype)
         distance = centre.norm(dim=-1, keepdim=True)
         forward = centre / distance

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Drawn
+from camtorch.augment.change import LazyWarp
 from camtorch.augment.filling import looked_at, with_care
 from camtorch.augment.jitter import PARTS, border, lens_ends, measured_once, sensitivity
 from camtorch.cameras.camera import Camera
@@ -133,8 +133,8 @@ class Start:
         call.made.limits2, call.made.extent = (tensor.data_ptr() for tensor in kept)
         return kept
 
-    def drawn(self, values: Mapping[str, Any], base: Camera, options: Options) -> Drawn:
-        """Return the new cameras, modules like `base`, of values (B,) and (B, size), or numbers and lists for one."""
+    def warp(self, values: Mapping[str, Any], base: Camera, options: Options) -> LazyWarp:
+        """Return the warp to cameras like `base` of values (B,) and (B, size), or numbers and lists for one."""
         call, native, names = structs.Draws.from_buffer_copy(self._call), self._native, self.names
         first = values[names[0]] if names else None
         rows = self._rows or (len(first) if isinstance(first, np.ndarray) else 1)
@@ -190,7 +190,7 @@ class Start:
         elif is_one and not left:
             made = single_native(model_of(self.base), intrinsics, k)
         factor, found = filled[:rows], filled[rows:]
-        return Drawn(base, intrinsics, k, self.size, rotation, options, self.before, made, factor, found)
+        return LazyWarp(base, intrinsics, k, self.size, rotation, options, self.before, made, factor, found)
 
     def _follow(self, left: int, call: structs.Draws) -> None:
         """Find what C has asked for of the cameras that it starts from."""

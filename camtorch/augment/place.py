@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from camtorch.augment.change import as_one
+from camtorch.augment.change import one_or_batch
 from camtorch.warp.views import place_of
 
 PLACE = "crop_place"
@@ -22,5 +22,5 @@ def put_place(sample: Mapping[str, Any], moved: dict[str, Any], owner: str) -> N
         )
     rotation = moved["rotation"]
     rotation = torch.stack(rotation) if isinstance(rotation, list) else rotation
-    camera = as_one(moved["camera"])
+    camera = one_or_batch(moved["camera"])
     moved[PLACE] = place_of(camera, rotation.to(camera.intrinsics))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Change, Drawn
+from camtorch.augment.change import Change, LazyWarp
 from camtorch.augment.fields import KINDS, field_of, in_range
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
@@ -54,8 +54,8 @@ class Plan:
         if max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != self.count:
             return {}
         options, sizes = moves.options, (part.camera.size_for("Warp"), part.image_size)
-        turns = source.dtype if is_single and isinstance(moves, Drawn) else None
-        is_turn = isinstance(moves, Drawn) and is_single and moves.is_turn
+        turns = source.dtype if is_single and isinstance(moves, LazyWarp) else None
+        is_turn = isinstance(moves, LazyWarp) and is_single and moves.is_turn
         settings = sizes, source.dtype, turns, is_turn, thread_count(), *options.values()
         if (known := calls.entry((), settings)) is None:
             ways = self._ways(values, options, turns, is_turn)

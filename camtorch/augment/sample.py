@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from camtorch.augment.change import Change, alone, as_one
+from camtorch.augment.change import Change, one_or_batch
 from camtorch.augment.clips import Clips
 from camtorch.augment.devices import remember_camera
 from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS, Named, is_batch
@@ -229,7 +229,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             camera = camera_of_images(named, camera, self.needs_camera, self._name)
         form = form_of(sample, camera, fields, self._calls.revision)
         if form is not None and (known := self._calls.plans.entry((), form)) is not None:
-            batch = Batch(known[2], sample, alone(camera), predicted)
+            batch = Batch(known[2], sample, one_or_batch(camera), predicted)
         else:
             batch = self._new_batch(sample, camera, fields, predicted)
             is_kept = all(v is sample[n] for n, v in batch.values.items())
@@ -252,7 +252,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             name: t for name, (_, value) in named.items() for t in (value if isinstance(value, list) else [value])
         }
         check_devices(owner, **tensors)
-        device, camera = next((t.device for t in tensors.values()), torch.device("cpu")), alone(as_one(camera))
+        device, camera = next((t.device for t in tensors.values()), torch.device("cpu")), one_or_batch(camera)
         if device.type == "cpu" and are_free():
             warn_if_missing()
         if camera.intrinsics.device != device:

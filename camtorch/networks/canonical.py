@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Change, Part, alone, as_one, by_kinds
+from camtorch.augment.change import Change, Part, by_kinds, one_or_batch
 from camtorch.augment.plan import Batch
 from camtorch.augment.sample import Sample, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
@@ -125,9 +125,10 @@ class CanonicalCamera(SampleTransform):
             return self._scale_sample(sample, batch, 1 / self.scale(batch.camera).expand(batch.plan.count))
         if (source := sample.pop("source_camera", None)) is None:
             raise ValueError(f"{self._name}: source_camera must be in the sample, as forward() returned it; got none")
-        source = as_one(source)
+        source = source if isinstance(source, Camera) else Mixed(source)
         change = self._change(source, len(source) if source.batch_shape else 1)
-        target = change.target if source.batch_shape else alone(change.target)  # a batch dim would be the sample's
+        # a batch dim would be the sample's
+        target = change.target if source.batch_shape else one_or_batch(change.target)
         batch = self._batch(sample, target, predicted=True)
         change = change if change.count == batch.plan.count else self._change(source, batch.plan.count)
         return self._resize_sample(sample, batch, change.inverse())
