@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from camtorch.values.arguments import as_number, shown, warn
 
 RangeLike = float | Sequence[float]
 
+Spans = SimpleNamespace  # by that name pickles of 0.4.0 have one that nothing reads
 _RADIANS = 0.8  # 45 degrees: a range of degrees within it is more likely in radians
 
 
