@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -69,8 +70,14 @@ _PLACES = {number: i for i, number in enumerate(INSIGHTFACE)}
 LANDMARKS["insightface106"] = tuple(INSIGHTFACE[LANDMARKS["lapa106"][_PLACES[i]]] for i in range(106))
 
 TableLike = str | Sequence[int] | Sequence[Sequence[int]]
-Table = tuple[tuple[int, ...], bool]
-"""An order, and whether it is for exactly so many landmarks; pairs fit any number from that on."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of landmarks that change places; pickles hold it."""
+
+    order: tuple[int, ...]
+    exact: bool  # whether it is for exactly so many landmarks; pairs fit any number from that on
 
 
 def as_table(value: TableLike, owner: str) -> Table:
@@ -79,7 +86,7 @@ def as_table(value: TableLike, owner: str) -> Table:
     if isinstance(value, str):
         if value not in LANDMARKS:
             raise ValueError(f"{wanted}; got {value!r}")
-        return LANDMARKS[value], True
+        return Table(LANDMARKS[value], True)
     try:
         items: list[Any] = list(value)
     except TypeError:
@@ -102,7 +109,7 @@ def as_table(value: TableLike, owner: str) -> Table:
             f"{owner}: landmarks must hold each landmark's partner, whose partner is the landmark itself, or "
             f"pairs that hold no index twice; got {value!r}"
         )
-    return tuple(order), not pairs
+    return Table(tuple(order), not pairs)
 
 
 # numbers of points that hardly anything else has
@@ -152,7 +159,7 @@ class Mirroring:
                     "landmarks={} to keep it"
                 )
             return None
-        order, exact = table
+        order, exact = table.order, table.exact
         own = len(order)
         if count == own or (count > own and not exact):
             return order + tuple(range(own, count))

@@ -271,6 +271,11 @@ def as_tensor(kind, numbers, dtype, shape, learns):
     return kind(value, learns) if kind is nn.Parameter else value.requires_grad_(learns)
 
 
+@pytest.mark.parametrize("name", ["ranges\nSpans", "landmarks\nTable", "landmarks\nMirroring"])
+def test_what_used_augmentations_of_0_4_0_hold_is_loaded(name):
+    assert pickle.loads(b"\x80\x02ccamtorch.augment.%b\n)\x81}X\x01\x00\x00\x00nK\x01sb." % name.encode()).n == 1
+
+
 class ByNumbers(pickle.Pickler):
     """Pickles tensors by their numbers, as the caches of Hugging Face do, and not by the place of their memory."""
 
