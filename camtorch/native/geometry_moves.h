@@ -335,7 +335,7 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
             found += count, count = 0;
         }
     } while (found);
-    T(lay_quintics)(given, &asked);
+    if (!given->keeps_quintics) T(lay_quintics)(given, &asked);
     return left;
 }
 

@@ -1835,38 +1835,55 @@ int32_t THIS(classify)(const Classification *given) {
 
 /* -- pixels of a lattice, u and v side by side, and the transpose of that */
 
-enum { LAID = 64, LAID_ROWS = 16 }; /* cells of a line, lines of cells of a strip */
+enum { LAID = 64, LAID_ROWS = 16, AROUND = 6 }; /* cells of a line, lines of cells of a strip, nodes around a cell along an axis */
 typedef float Pairs[2 * LAID * STEP];
+typedef float Polynomials[AROUND][STEP];
+
+/* Of the six nodes around a cell, those of polynomials through four, or all, on the way from its first one to the next */
+static void lay_weights(int64_t taps, Polynomials weights) {
+    const int first = (int)(AROUND - taps) / 2, end = AROUND - first;
+    int j, k, m;
+    memset(weights, 0, sizeof(Polynomials));
+    for (j = first; j < end; j++)
+        for (k = 0; k < STEP; k++) {
+            double weight = 1;
+            for (m = first; m < end; m++) weight *= m == j ? 1 : ((double)k / STEP + 2 - m) / (j - m);
+            weights[j][k] = (float)weight;
+        }
+}
 
 /* Some rows of cells of a camera, from the one at `first` on */
-static void lay_strip(const Laying *given, int64_t b, int64_t first, int64_t end) {
+static void lay_strip(const Laying *given, const Polynomials w, int64_t b, int64_t first, int64_t end) {
     const int64_t width = given->columns + 5, plane = (given->rows + 5) * width, far = given->exact_count * STEP * STEP;
     int64_t column, i, j, y;
     int k, c;
     for (column = 0; column < given->columns; column += LAID) {
         const int64_t left = given->columns - column, count = left < LAID ? left : LAID, x = column * STEP;
         const int64_t n = given->width - x < count * STEP ? given->width - x : count * STEP;
-        _Alignas(64) Pairs lines[4];
+        _Alignas(64) Pairs lines[AROUND];
         uint8_t mapped[LAID * STEP];
         for (i = first; i < end; i++) {
             const int32_t *cells = given->cells + (b * given->rows + i) * given->columns + column;
-            for (j = i == first ? i + 1 : i + 4; j < i + 5; j++) {
-                const float *u = given->nodes + 2 * b * plane + j * width + column + 1, *v = u + plane;
+            for (j = i == first ? i : i + AROUND - 1; j < i + AROUND; j++) {
+                const float *u = given->nodes + 2 * b * plane + j * width + column, *v = u + plane;
                 for (y = 0; y < count; y++)
                     for (k = 0; k < STEP; k++) {
-                        float *to = lines[j % 4] + 2 * (y * STEP + k), sums[2] = {0, 0};
-                        for (c = 0; c < 4; c++) sums[0] += WEIGHTS[c][k] * u[y + c], sums[1] += WEIGHTS[c][k] * v[y + c];
+                        float *to = lines[j % AROUND] + 2 * (y * STEP + k), sums[2] = {0, 0};
+                        for (c = 0; c < AROUND; c++) sums[0] += w[c][k] * u[y + c], sums[1] += w[c][k] * v[y + c];
                         to[0] = sums[0], to[1] = sums[1];
                     }
             }
             for (j = 0; j < count; j++) memset(mapped + j * STEP, cells[j] != CELL_EMPTY, STEP);
+            const float *l0 = lines[i % AROUND], *l1 = lines[(i + 1) % AROUND], *l2 = lines[(i + 2) % AROUND];
+            const float *l3 = lines[(i + 3) % AROUND], *l4 = lines[(i + 4) % AROUND], *l5 = lines[(i + 5) % AROUND];
             for (y = i * STEP; y < (i + 1) * STEP && y < given->height; y++) {
                 const int64_t at = (b * given->height + y) * given->width + x;
                 const int part = (int)(y % STEP);
                 float *__restrict to = given->grid + 2 * at;
-                const float w0 = WEIGHTS[0][part], w1 = WEIGHTS[1][part], w2 = WEIGHTS[2][part], w3 = WEIGHTS[3][part];
-                const float *l0 = lines[(i + 1) % 4], *l1 = lines[(i + 2) % 4], *l2 = lines[(i + 3) % 4], *l3 = lines[i % 4];
-                for (j = 0; j < 2 * n; j++) to[j] = l0[j] * w0 + l1[j] * w1 + l2[j] * w2 + l3[j] * w3;
+                const float w0 = w[0][part], w1 = w[1][part], w2 = w[2][part], w3 = w[3][part], w4 = w[4][part];
+                const float w5 = w[5][part];
+                for (j = 0; j < 2 * n; j++)
+                    to[j] = l0[j] * w0 + l1[j] * w1 + l2[j] * w2 + l3[j] * w3 + l4[j] * w4 + l5[j] * w5;
                 memcpy(given->mapped + at, mapped, (size_t)n);
                 for (j = 0; j < n; j++) {
                     const int32_t cell = cells[j / STEP];
@@ -1885,70 +1902,73 @@ static void lay_strip(const Laying *given, int64_t b, int64_t first, int64_t end
 }
 
 /* Adds what a line of gradients says to those of a row of nodes, and clears the line */
-static void gather_line(float *line, int64_t count, float *u, float *v) {
+static void gather_line(const Polynomials w, float *line, int64_t count, float *u, float *v) {
+    float turned[2 * STEP][LAID]; /* a row of cells for each of their pixels */
     int64_t j;
     int k, c;
     for (j = 0; j < count; j++)
-        for (c = 0; c < 4; c++) {
-            float sums[2] = {0, 0};
-            for (k = 0; k < STEP; k++) {
-                sums[0] += WEIGHTS[c][k] * line[2 * (j * STEP + k)];
-                sums[1] += WEIGHTS[c][k] * line[2 * (j * STEP + k) + 1];
-            }
-            u[j + c] += sums[0], v[j + c] += sums[1];
+        for (k = 0; k < 2 * STEP; k++) turned[k][j] = line[2 * STEP * j + k];
+    for (c = 0; c < AROUND; c++)
+        for (k = 0; k < STEP; k++) {
+            for (j = 0; j < count; j++) u[j + c] += w[c][k] * turned[2 * k][j];
+            for (j = 0; j < count; j++) v[j + c] += w[c][k] * turned[2 * k + 1][j];
         }
     memset(line, 0, (size_t)count * 2 * STEP * sizeof *line);
 }
 
+/* Adds a row of gradients to those of the six lines that it lies between, at `part` / 8 from the third to the fourth one */
+NOT_INLINE void spread_row(const Polynomials w, int part, const float *from, int64_t n, float *__restrict l0,
+                           float *__restrict l1, float *__restrict l2, float *__restrict l3, float *__restrict l4,
+                           float *__restrict l5) {
+    const float w0 = w[0][part], w1 = w[1][part], w2 = w[2][part], w3 = w[3][part], w4 = w[4][part], w5 = w[5][part];
+    int64_t j;
+    for (j = 0; j < n; j++) {
+        const float g = from[j];
+        l0[j] += w0 * g, l1[j] += w1 * g, l2[j] += w2 * g, l3[j] += w3 * g, l4[j] += w4 * g, l5[j] += w5 * g;
+    }
+}
+
 /* The gradients of a camera's nodes and exact positions */
-static void gather(const Laying *given, int64_t b) {
+static void gather(const Laying *given, const Polynomials w, int64_t b) {
     const int64_t width = given->columns + 5, plane = (given->rows + 5) * width, far = given->exact_count * STEP * STEP;
     int64_t column, i, j, y;
     for (column = 0; column < given->columns; column += LAID) {
         const int64_t left = given->columns - column, count = left < LAID ? left : LAID, x = column * STEP;
         const int64_t n = given->width - x < count * STEP ? given->width - x : count * STEP;
-        float *nodes = given->nodes + 2 * b * plane + column + 1;
-        _Alignas(64) Pairs lines[4], own;
+        float *nodes = given->nodes + 2 * b * plane + column;
+        _Alignas(64) Pairs lines[AROUND], own;
         memset(lines, 0, sizeof lines);
-        for (i = 0; i < given->rows; i++) {
+        for (i = 0; i < given->rows + AROUND - 1; i++) {
             const int32_t *cells = given->cells + (b * given->rows + i) * given->columns + column;
             int cubic = 1;
-            for (j = 0; j < count; j++) cubic &= cells[j] == CELL_CUBIC;
+            for (j = 0; j < count && i < given->rows; j++) cubic &= cells[j] == CELL_CUBIC;
             for (y = i * STEP; y < (i + 1) * STEP && y < given->height; y++) {
                 const int part = (int)(y % STEP);
                 const float *from = given->grid + 2 * ((b * given->height + y) * given->width + x);
-                const float w0 = WEIGHTS[0][part], w1 = WEIGHTS[1][part], w2 = WEIGHTS[2][part], w3 = WEIGHTS[3][part];
-                float *__restrict l0 = lines[(i + 1) % 4], *__restrict l1 = lines[(i + 2) % 4];
-                float *__restrict l2 = lines[(i + 3) % 4], *__restrict l3 = lines[i % 4];
-                if (!cubic) {
-                    for (j = 0; j < n; j++) {
-                        const int32_t cell = cells[j / STEP];
-                        const int is_cubic = cell == CELL_CUBIC;
-                        own[2 * j] = is_cubic ? from[2 * j] : 0, own[2 * j + 1] = is_cubic ? from[2 * j + 1] : 0;
-                        if (is_cubic || cell == CELL_EMPTY) continue;
-                        float *exact = given->exact + (cell * (int64_t)STEP + part) * STEP + j % STEP;
-                        exact[0] = from[2 * j], exact[far] = from[2 * j + 1];
-                    }
-                    from = own;
+                for (j = 0; j < n && !cubic; j++) {
+                    const int32_t cell = cells[j / STEP];
+                    const int is_cubic = cell == CELL_CUBIC;
+                    own[2 * j] = is_cubic ? from[2 * j] : 0, own[2 * j + 1] = is_cubic ? from[2 * j + 1] : 0;
+                    if (is_cubic || cell == CELL_EMPTY) continue;
+                    float *exact = given->exact + (cell * (int64_t)STEP + part) * STEP + j % STEP;
+                    exact[0] = from[2 * j], exact[far] = from[2 * j + 1];
                 }
-                for (j = 0; j < 2 * n; j++) {
-                    const float g = from[j];
-                    l0[j] += w0 * g, l1[j] += w1 * g, l2[j] += w2 * g, l3[j] += w3 * g;
-                }
+                spread_row(w, part, cubic ? from : own, 2 * n, lines[i % AROUND], lines[(i + 1) % AROUND],
+                           lines[(i + 2) % AROUND], lines[(i + 3) % AROUND], lines[(i + 4) % AROUND], lines[(i + 5) % AROUND]);
             }
-            gather_line(lines[(i + 1) % 4], count, nodes + (i + 1) * width, nodes + (i + 1) * width + plane);
+            gather_line(w, lines[i % AROUND], count, nodes + i * width, nodes + i * width + plane);
         }
-        for (i = given->rows + 1; i < given->rows + 4; i++)
-            gather_line(lines[i % 4], count, nodes + i * width, nodes + i * width + plane);
     }
 }
 
 void THIS(lay)(Laying *given) {
     const int64_t strips = given->is_transposed ? 1 : (given->rows + LAID_ROWS - 1) / LAID_ROWS;
     int64_t i;
+    Polynomials weights;
+    lay_weights(given->taps, weights);
     while ((i = __atomic_fetch_add(&given->next, 1, __ATOMIC_RELAXED)) < strips * given->count) {
         const int64_t first = i % strips * LAID_ROWS, end = first + LAID_ROWS;
-        if (given->is_transposed) gather(given, i);
-        else lay_strip(given, i / strips, first, end < given->rows ? end : given->rows);
+        if (given->is_transposed) gather(given, weights, i);
+        else lay_strip(given, weights, i / strips, first, end < given->rows ? end : given->rows);
     }
 }

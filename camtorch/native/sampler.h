@@ -80,6 +80,7 @@ typedef struct {
     float *grid;     /* (b, y, x, component), without gaps */
     uint8_t *mapped; /* (b, y, x): whether there is a position; not of gradients */
     int64_t count, rows, columns, height, width;
+    int64_t taps;          /* nodes of a polynomial along each axis: four, or six */
     int64_t is_transposed; /* nodes are then zeros at first */
     int64_t next;          /* the strip, or if it is transposed the camera, that whoever is free takes */
 } Laying;

@@ -21,7 +21,7 @@ from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_free, are_plain, is_unknown
 from camtorch.native import sampler
 from camtorch.native.library import native_available
-from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_TODO, POSITIONS, STEP
+from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_QUINTIC, CELL_TODO, POSITIONS, STEP
 from camtorch.poses.rotations import turn
 from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.native_calls import Between
@@ -73,6 +73,7 @@ class Lattice:
     Nodes begin at pixel (-16, -16); a cubic is laid through four along each axis. `cells` (B, n, m) int32 are
     `CELL_EMPTY`, `CELL_CUBIC`, or a place in `exact` (2, K, 8, 8), positions for each pixel, NaN where none is mapped.
 
+    taps: 6 if quintics, through six nodes, are laid instead, for derivatives.
     done: (3, K) the cells of `exact`, in its order; None where `cells` may be looked at.
     """
 
@@ -81,6 +82,7 @@ class Lattice:
     exact: Tensor
     size: tuple[int, int]
     done: Tensor | None = None
+    taps: int = 4
 
     def on(self, device: torch.device) -> Lattice:
         """Send a lattice from the CPU to another device."""
@@ -112,9 +114,9 @@ class Lattice:
             nodes, exact, cells = self.nodes, self.exact, self.cells
             single = nodes.dtype == torch.float32 and self.done is None
             if single and native_available() and is_eager(nodes, exact, cells):
-                grid, seen = _Pixels.apply(nodes, exact, cells, self.size)  # type: ignore[no-untyped-call]
+                grid, seen = _Pixels.apply(nodes, exact, cells, self.size, self.taps)  # type: ignore[no-untyped-call]
             else:
-                grid, seen = _pixel_by_pixel(nodes, exact, cells, self.size, self.done)
+                grid, seen = _pixel_by_pixel(nodes, exact, cells, self.size, self.taps, self.done)
             return Sampling(grid, seen, None)
 
 
@@ -122,10 +124,12 @@ class _Pixels(Function):
     """Positions of a lattice's pixels, and whether there are any, in compiled code; derived again, by torch."""
 
     @staticmethod
-    def forward(ctx: Any, nodes: Tensor, exact: Tensor, cells: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        grid, seen = sampler.lay(nodes, cells, exact, size)
+    def forward(
+        ctx: Any, nodes: Tensor, exact: Tensor, cells: Tensor, size: tuple[int, int], taps: int
+    ) -> tuple[Tensor, Tensor]:
+        grid, seen = sampler.lay(nodes, cells, exact, size, taps)
         ctx.save_for_backward(nodes, exact, cells)
-        ctx.size = size
+        ctx.size, ctx.taps = size, taps
         ctx.mark_non_differentiable(seen)
         return grid, seen
 
@@ -133,20 +137,20 @@ class _Pixels(Function):
     def backward(ctx: Any, by_grid: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         nodes, exact, cells = ctx.saved_tensors
         if not torch.is_grad_enabled() and is_eager(by_grid):
-            return *sampler.lay_vjp(by_grid, cells, exact.shape[1]), None, None
+            return *sampler.lay_vjp(by_grid, cells, exact.shape[1], ctx.taps), None, None, None
         leaves = nodes.detach().requires_grad_(), exact.detach().requires_grad_()
         with torch.enable_grad():  # it is linear
-            grid, _ = _pixel_by_pixel(leaves[0], leaves[1], cells, ctx.size, None)
+            grid, _ = _pixel_by_pixel(leaves[0], leaves[1], cells, ctx.size, ctx.taps)
         by_nodes, by_exact = torch.autograd.grad(grid, leaves, by_grid, create_graph=True, materialize_grads=True)
-        return by_nodes, by_exact, None, None
+        return by_nodes, by_exact, None, None, None
 
 
 def _pixel_by_pixel(
-    nodes: Tensor, exact: Tensor, cells: Tensor, size: tuple[int, int], done: Tensor | None
+    nodes: Tensor, exact: Tensor, cells: Tensor, size: tuple[int, int], taps: int, done: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return positions (B, h, w, 2) of a lattice's pixels, and whether there are any, bool (B, h, w); by torch."""
     (height, width), (_, n, m) = size, cells.shape
-    planes = interpolated(nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
+    planes = interpolated(nodes if taps == 6 else nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
     blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))
     some = cells != CELL_EMPTY
     if not (may_look(some) and bool(some.all())):
@@ -313,22 +317,30 @@ def local_scale(grid: Tensor, mapped: Tensor, source: Camera) -> Tensor:
 
 
 def on_lattice(
-    source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, rows: range, padding: str
+    source: Camera,
+    target: Camera,
+    rotation: Tensor | None,
+    tolerance: float,
+    rows: range,
+    padding: str,
+    keeps_quintics: bool = False,
 ) -> Lattice | None:
     """Return positions within `tolerance` pixels of the exact ones, from a lattice of every eighth pixel.
 
     If fourth differences show that cubics may miss, positions in the middle of a cell and of its sides decide. There
     a cell's pixels come one by one, from quintics if these do not miss, else from the cameras, as at the limit of what
     is mapped. None if that is most of the image. An edge between four nodes alone is not seen. Positions outside of the
-    image that the padding does not need keep no tolerance; for "reflection" all do. If a camera or the rotation learns,
-    the nodes, and the pixels that come from the cameras, are computed again, with a graph.
+    image that the padding does not need keep no tolerance; for "reflection" all do.
+
+    If a camera or the rotation learns, nodes with a graph follow, and quintics everywhere; `keeps_quintics` leaves
+    cells that need them as `CELL_QUINTIC`.
     """
     tensors = [*source.tensors, *target.tensors, *(() if rotation is None else (rotation,))]
     if keeps_graph(*tensors):
         if not is_eager(*tensors):
             return None
         with torch.no_grad():
-            found = on_lattice(source, target, rotation, tolerance, rows, padding)
+            found = on_lattice(source, target, rotation, tolerance, rows, padding, keeps_quintics=True)
         return None if found is None else _with_graph(found, source, target, rotation, rows)
     like, (height, width) = _like(target), (len(rows), target.size_for("Warp")[1])
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
@@ -340,7 +352,7 @@ def on_lattice(
     nodes, size = (n + 5) * (m + 5), source.size_for("Warp")
     pixels = (kept_probes if nodes <= MOST_KEPT else kept_probes.__wrapped__)(rows, width, like.dtype)
     if native is not None:
-        made = native.lattices(pixels, (height, width), rows.start, tolerance, padding)
+        made = native.lattices(pixels, (height, width), rows.start, tolerance, padding, keeps_quintics)
         return None if made is None else Lattice(*made, (height, width))
     exact = partial(_positions, source, target, rotation, None)
     positions, mapped = exact(pixels)  # (B, 1, N, 2)
@@ -353,21 +365,26 @@ def on_lattice(
     if 8 * int((cells == CELL_TODO).sum((1, 2)).max()) > 7 * n * m:
         return None
     computed = _compute(exact, rows.start, cells, cells == CELL_TODO, like)
-    computed = torch.cat((computed, lay_quintics(lattice, cells, computed.shape[1])), 1)
+    if not keeps_quintics:
+        computed = torch.cat((computed, lay_quintics(lattice, cells, computed.shape[1])), 1)
     return Lattice(lattice, cells, computed, (height, width))
 
 
 def _with_graph(found: Lattice, source: Camera, target: Camera, rotation: Tensor | None, rows: range) -> Lattice:
     """Return a lattice with the cells of one that was found without a graph."""
-    exact, (height, width) = partial(_positions, source, target, rotation, None), found.size
-    _, n, m = found.cells.shape
+    exact, (height, width), cells = partial(_positions, source, target, rotation, None), found.size, found.cells
+    like, (_, n, m) = _like(target), cells.shape
     count = (n + 5) * (m + 5)
-    pixels = (kept_probes if count <= MOST_KEPT else kept_probes.__wrapped__)(rows, width, _like(target).dtype)
-    nodes = exact(pixels[:, :count])[0][:, 0].movedim(-1, 1).unflatten(2, (n + 5, m + 5))
-    todo, computed = found.cells >= 0, nodes.new_empty(2, 0, STEP, STEP)
+    pixels = (kept_probes if count <= MOST_KEPT else kept_probes.__wrapped__)(rows, width, like.dtype)
+    positions, mapped = exact(pixels[:, :count])
+    nodes, computed = positions[:, 0].movedim(-1, 1).unflatten(2, (n + 5, m + 5)), like.new_empty(2, 0, STEP, STEP)
+    # quintics reach one node further than cubics
+    end = F.max_pool2d((~mapped).view(-1, n + 5, m + 5).to(like.dtype), 6, 1) > 0
+    todo = (cells >= 0) | ((cells == CELL_CUBIC) & end)
+    cells.masked_fill_(cells == CELL_QUINTIC, CELL_CUBIC)
     if bool(todo.any()):
-        computed = _compute(exact, rows.start, found.cells, todo, _like(target))
-    return Lattice(nodes, found.cells, computed, (height, width))
+        computed = _compute(exact, rows.start, cells, todo, like)
+    return Lattice(nodes, cells, computed, (height, width), taps=6)
 
 
 def coarse(size: tuple[int, ...]) -> tuple[int, int]:
@@ -430,19 +447,21 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
 
 
 def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
-    """Interpolate nodes (B, 2, rows + 3, columns + 3) to pixels (B, 2, 8 rows, 8 columns)."""
+    """Interpolate nodes (B, 2, rows + 3, columns + 3), or + 5 for quintics, to pixels (B, 2, 8 rows, 8 columns)."""
     # torch may be told to multiply matrices in less than float32
     wide = nodes.dtype if torch.get_float32_matmul_precision() == "highest" else torch.float64
-    form = nodes.dtype, wide, nodes.device
+    taps = nodes.shape[2] - rows + 1
+    form = taps, nodes.dtype, wide, nodes.device
     weights, spread = _weights(*form) if nodes.is_cpu else _kept_weights((), form, lambda: _weights(*form))
-    terms = (nodes[:, :, i : i + rows, None] * weights[:, i, None] for i in range(4))
+    terms = (nodes[:, :, i : i + rows, None] * weights[:, i, None] for i in range(taps))
     lines = reduce(torch.add, terms).flatten(0, 3).to(wide)
     result = lines.new_empty(len(lines), columns * STEP)
     cells = _BLOCK // STEP
     with torch.autocast(nodes.device.type, enabled=False):
         for first in range(0, columns, cells):
             n = min(cells, columns - first)
-            factors = lines[:, first : first + n + 3], spread[: n + 3, :n].flatten(1)
+            reach = n + taps - 1
+            factors = lines[:, first : first + reach], spread[:reach, :n].flatten(1)
             block = result[:, first * STEP : (first + n) * STEP]
             if lines.requires_grad:
                 block.copy_(torch.mm(*factors))
@@ -451,13 +470,12 @@ def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
     return result.to(nodes.dtype).view(len(nodes), 2, rows * STEP, columns * STEP)
 
 
-def _weights(dtype: torch.dtype, wide: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return weights (8, 4) of nodes at -1, 0, 1, 2 in their cubic at 0, 1/8, ..., 7/8; and of a wide block."""
-    t = torch.arange(STEP, dtype=torch.float64, device=device) / STEP
-    before, at, after, beyond = t + 1, t, t - 1, t - 2
-    parts = -at * after * beyond / 6, before * after * beyond / 2, -before * at * beyond / 2, before * at * after / 6
+def _weights(taps: int, dtype: torch.dtype, wide: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return weights (8, taps) of nodes in their polynomial on the way from the middle one to the next; of a block."""
+    t, at = torch.arange(STEP, dtype=torch.float64, device=device) / STEP, range(1 - taps // 2, taps // 2 + 1)
+    parts = [math.prod(((t - m) / (k - m) for m in at if m != k), start=torch.ones_like(t)) for k in at]
     weights, cells = torch.stack(parts, -1).to(dtype), _BLOCK // STEP
-    spread = weights.new_zeros(cells + 3, cells, STEP, dtype=wide)
+    spread = weights.new_zeros(cells + taps - 1, cells, STEP, dtype=wide)
     for cell in range(cells):
-        spread[cell : cell + 4, cell] = weights.T
+        spread[cell : cell + taps, cell] = weights.T
     return weights, spread
