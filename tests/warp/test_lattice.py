@@ -5,11 +5,24 @@ from pathlib import Path
 
 import pytest
 import torch
-from cameras import each_kind, make, real, turn
+from cameras import RARE_ARE_SLOW, each_kind, make, real, turn
 
 import camtorch as ct
+from camtorch.native import sampler
+from camtorch.native.library import native_available
+from camtorch.warp import cells, grid
 
 TOLERANCES = (0.1, 0.01)
+
+
+@pytest.fixture(params=["compiled", "torch"])
+def way(request, monkeypatch):
+    """The lattice as compiled code lays it, and as torch does where there is none."""
+    if request.param == "compiled" and not native_available():
+        pytest.skip("there is no compiled library")
+    if request.param == "torch":
+        monkeypatch.setattr(grid, "native_available", lambda: False)
+        monkeypatch.setattr(grid, "_native", lambda *_: None)
 
 
 def check(source, target, rotation):
@@ -41,6 +54,7 @@ def check_padded(source, target, rotation, padding):
 
 
 @pytest.mark.parametrize(("key", "padding"), [("division", "border"), ("brown_conrady", "reflection")])
+@pytest.mark.usefixtures("way")
 def test_tolerances_hold_beyond_the_rim(key, padding):
     camera = next(iter(real(key).values())).float().requires_grad_(False).resize(240, 320)
     wide = ct.KannalaBrandt(torch.tensor([50.0, 50.0, 159.5, 119.5]), torch.zeros(4), image_size=(240, 320))
@@ -49,7 +63,36 @@ def test_tolerances_hold_beyond_the_rim(key, padding):
     check_padded(camera, wide, None, padding)
 
 
+@pytest.mark.skipif(not native_available(), reason="there is no compiled library")
+@pytest.mark.parametrize("key", RARE_ARE_SLOW)
+def test_torch_doubts_the_cells_that_compiled_code_doubts(key, monkeypatch):
+    """Cell by cell, and so the positions: of cells that are settled, of limits, of the rim, of far outside."""
+    camera = next(iter(real(key).values())).float().requires_grad_(False).resize(240, 317)
+    target, rotation = ct.Dewarp(camera).target, turn(20.0, -10.0, 30.0)
+    compared = []
+
+    def both(*given):
+        found = cells.classify(*given)
+        assert torch.equal(found, sampler.classify(*given))
+        compared.append(found)
+        return found
+
+    for pair in ((camera, target), (target, camera), (camera, camera)):
+        for padding, tolerance in (("zeros", 1e-3), ("border", 1e-3), ("reflection", 0.1)):
+            given = *pair, rotation, tolerance, range(240), padding
+            compiled = grid.on_lattice(*given)
+            with monkeypatch.context() as patch:
+                patch.setattr(grid, "native_available", lambda: False)
+                patch.setattr(grid, "_native", lambda *_: None)
+                patch.setattr(grid, "classify", both)
+                laid = grid.on_lattice(*given)
+            if compiled is not None and laid is not None:
+                assert torch.equal(compiled.pixels.mapped, laid.pixels.mapped)
+    assert len(compared) == 9
+
+
 @each_kind
+@pytest.mark.usefixtures("way")
 def test_real_lenses_keep_their_tolerance(key):
     camera = next(iter(real(key).values())).float().requires_grad_(False).resize(240, 320)
     rotation = turn(20.0, -10.0, 30.0)
@@ -63,6 +106,7 @@ HARD = json.loads((Path(__file__).parents[1] / "golden" / "warps" / "hard.json")
 
 
 @pytest.mark.parametrize("what", HARD)
+@pytest.mark.usefixtures("way")
 def test_hard_warps_keep_their_tolerance(what):
     case, dtype = HARD[what], getattr(torch, HARD[what]["dtype"])
     source, target = (

@@ -7,7 +7,6 @@ import torch
 from cameras import pinhole, turn
 
 import camtorch as ct
-from camtorch.native.library import native_available
 
 SIZE = (120, 160)
 
@@ -85,7 +84,6 @@ def test_pixels_without_a_ray_take_the_fill_in_every_padding_mode():
         assert (warp(torch.rand(1, 1, *SIZE))[0, 0][without] == 7).all()
 
 
-@pytest.mark.skipif(not native_available(), reason="without the compiled library positions are exact")
 @pytest.mark.parametrize("small", [False, True])
 def test_a_lattice_is_used_and_small_images_do_without(small):
     cameras = [pinhole(SIZE, focal, torch.float64) for focal in (140.0, 120.0)]
