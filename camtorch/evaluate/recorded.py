@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from camtorch.evaluate.door import in_transform, is_for_here, keeps_graph
+from camtorch.evaluate.door import in_transform, is_eager, is_for_here, keeps_graph
 
 Result = TypeVar("Result")
 
@@ -80,9 +80,9 @@ def power_of_two(size: Tensor) -> Tensor:
 
 
 def order_of(order: int, *inputs: Tensor) -> int:
-    """Return the order of the derivatives that a recorded inverse must have: 0 in compiled code that does not learn."""
-    compiled = torch.compiler.is_compiling() and not in_transform()
-    return 0 if compiled and not keeps_graph(*inputs) else order
+    """Return the order of the derivatives that a recorded inverse must have: 0 if nothing learns, and that is known."""
+    known = is_eager(*inputs) or (torch.compiler.is_compiling() and not in_transform())
+    return 0 if known and not keeps_graph(*inputs) else order
 
 
 def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:

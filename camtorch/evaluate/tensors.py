@@ -19,6 +19,11 @@ def known_true(condition: Tensor) -> bool:
     return may_look(condition) and bool(condition.all())
 
 
+def may_look_at(values: Tensor, *others: Tensor) -> bool:
+    """Whether a formula may read values: to leave out what points need that are not valid, or steps that move none."""
+    return values.numel() > 0 and is_eager(values, *others)
+
+
 def is_unknown(tensor: Tensor) -> bool:
     """Whether values may not be read: they are traced, or within a transform, whose derivatives go forward."""
     return in_transform() or not is_concrete(tensor)

@@ -12,7 +12,7 @@ from torch import Tensor
 from camtorch.evaluate.export import as_index, is_portable_export, of_points, repeat, times
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.recorded import CLASSES
-from camtorch.evaluate.tensors import are_known
+from camtorch.evaluate.tensors import are_known, may_look_at
 from camtorch.native.structs import NODES
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.values.arguments import columns
@@ -179,7 +179,7 @@ class InverseTable:
 
 def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor, Tensor]:
     """Return the factor by which the inverse scales points of squared radius r2, and a number > 0 if it converged."""
-    scale, converged = table(r2), None
+    scale, converged, looks = table(r2), None, may_look_at(r2)
     for _ in range(MOST_STEPS):  # of Newton's method for s R(r2 s^2) = 1, in which the axis is not special
         t = r2 * scale * scale
         factor, slope = radial.derivatives(t, 1)
@@ -188,6 +188,8 @@ def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor
             step = torch.where(converged > 0, 0.0, step)
         scale = scale + step
         converged = short(scale.dtype) * scale - step.abs()
+        if looks and bool(converged.amin() > 0):
+            break
     assert converged is not None  # there are steps
     return scale, converged
 

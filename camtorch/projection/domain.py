@@ -12,6 +12,7 @@ from torch import Tensor
 from camtorch.evaluate.devices import sent
 from camtorch.evaluate.export import of_points, plus
 from camtorch.evaluate.kept import Kept
+from camtorch.evaluate.tensors import may_look_at
 from camtorch.native.structs import AZIMUTHS, MOST_RADII
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
 from camtorch.projection.fold import Extent, azimuth, limits_and_extent
@@ -199,6 +200,14 @@ class Domain:
         """Return a margin, positive for the plane points (C, N) in the domain; t is a^2 + b^2."""
         inside = self.safe_radius_sq - t
         if self.lens.is_radial or self.all_stagewise:
+            return inside
+        if may_look_at(inside):  # few points are as far out
+            places = (~(inside > 0)).nonzero(as_tuple=True)
+            if len(camera := places[0]):
+                a, b = a[places], b[places]
+                before = self.limits2[camera, azimuth(a, b)] - t[places]
+                outside = torch.minimum(before, regular(self.optics_of(camera)[1], a, b))
+                inside[places] = torch.maximum(inside[places], outside)
             return inside
         index = azimuth(a, b)
         index = index + torch.arange(self.k.shape[0], device=t.device, dtype=index.dtype).unsqueeze(-1) * AZIMUTHS

@@ -22,6 +22,7 @@ from camtorch.projection.rows import CameraRows, Direction, unusable
 from camtorch.values.arguments import Numbers, as_points, present, warn
 
 _MANY = 1_000_000  # points of a call that a user waits for
+_BLOCK = 1 << 17  # points of all cameras, for each thread
 
 if TYPE_CHECKING:
     from camtorch.projection.native_cameras import Native
@@ -80,7 +81,17 @@ def evaluate_rows(
         return planes, valid
     if way.is_native and rows.shape[0] * rows.shape[1] >= _MANY:
         warn_if_missing()
-    return direction.formula(type(camera), *inputs, known, way.order)
+    formula = partial(direction.formula, type(camera))
+    if known is None or rows.shape[0] * rows.shape[1] <= _BLOCK or not are_free(*inputs):
+        return formula(*inputs, known, way.order)
+    # block by block, which stay in a cache from one operation to the next
+    step = max(_BLOCK * torch.get_num_threads() // len(rows), 1)
+    planes = rows.new_empty(5 - rows.shape[2], *rows.shape[:2])
+    valid = torch.empty(planes.shape[1:], dtype=torch.bool, device=planes.device)
+    for i in range(0, rows.shape[1], step):
+        part = slice(i, i + step)
+        planes[..., part], valid[..., part] = formula(rows[:, part], intrinsics, distortion, known, way.order)
+    return planes, valid
 
 
 def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Native], bool] | None:

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.recorded import as_kept, positive, power_of_two, to_planes, without_keeping
+from camtorch.evaluate.recorded import as_kept, order_of, positive, power_of_two, to_planes, without_keeping
+from camtorch.evaluate.tensors import may_look_at
 from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection import native_calls
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.native_cameras import Native
-from camtorch.projection.rows import CameraRows, Direction, Traced, replace, to_mask
+from camtorch.projection.rows import CameraRows, Direction, Traced, both, replace, to_mask
 from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
@@ -21,18 +22,26 @@ if TYPE_CHECKING:
 INVALID_PIXEL = -1.0  # outside every image, so that `contains` is False for it as well
 
 
-def _normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor) -> tuple[Planes3, Tensor]:
+def _normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor, looks: bool) -> tuple[Planes3, Tensor | None]:
     """Return rays, their largest component near 1, the axis for invalid ones, and the mask of those covered."""
     x_0, y_0, z_0 = x.detach(), y.detach(), z.detach()
     size = torch.maximum(torch.maximum(x_0.abs(), y_0.abs()), z_0.abs())
     # NaN fails both comparisons; closer to the origin the derivative leaves the floating-point range
-    valid = ((size > floor_of(size.dtype)) & (size < torch.inf)).to(size.dtype)
+    least = floor_of(size.dtype)
+    ends = size.aminmax() if looks else None
+    is_valid = ends is not None and bool(ends[0] > least) and bool(ends[1] < torch.inf)
+    valid = None if is_valid else ((size > least) & (size < torch.inf)).to(size.dtype)
     # it is a constant: the projection does not depend on the distance, so it has no part in the derivative
-    shrink = as_kept(power_of_two(torch.where(valid > 0, size, 1.0)).reciprocal())
-    x_0, y_0, z_0 = (torch.where(valid > 0, w, axis) * shrink for w, axis in ((x_0, 0.0), (y_0, 0.0), (z_0, 1.0)))
-    x, y, z = (torch.where(valid > 0, w, axis) * shrink for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
-    mask = as_kept(valid * to_mask(chart.margin(x_0, y_0, z_0)))
-    x, y, z = (replace(mask, w, axis) for w, axis in ((x, 0.0), (y, 0.0), (z, 1.0)))
+    shrink = as_kept(power_of_two(replace(valid, size, 1.0)).reciprocal())
+
+    def shrunk(*ray: Tensor) -> list[Tensor]:
+        return [replace(valid, w, axis) * shrink for w, axis in zip(ray, (0.0, 0.0, 1.0), strict=True)]
+
+    rays = shrunk(x, y, z)
+    margin = chart.margin(*([w.detach() for w in rays] if looks else shrunk(x_0, y_0, z_0)))
+    mask = both(valid, to_mask(margin, looks))
+    mask = None if mask is None else as_kept(mask)
+    x, y, z = (replace(mask, w, axis) for w, axis in zip(rays, (0.0, 0.0, 1.0), strict=True))
     return (x, y, z), mask
 
 
@@ -46,25 +55,30 @@ def _formula(
 ) -> tuple[Tensor, Tensor]:
     """Return pixels (2, C, N) for points (C, N, 3), and valid (C, N); see `Direction.formula`."""
     traced = Traced.of(model, intrinsics, distortion, cameras)
+    looks = may_look_at(points, intrinsics, distortion)
 
-    def evaluate(x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
+    def evaluate(
+        x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
         chart, lens = traced.optics(distortion)
-        rays, mask = _normalise(chart, x, y, z)
+        rays, mask = _normalise(chart, x, y, z, looks)
         a, b = chart.to_plane(*rays, order)
         if lens.stages:
             t = torch.addcmul(a * a, b, b)
-            inside = as_kept(to_mask(traced.domain.margin(a.detach(), b.detach(), t.detach())))
+            inside = to_mask(traced.domain.margin(a.detach(), b.detach(), t.detach()), looks)
+            inside = None if inside is None else as_kept(inside)
             a, b, t = (replace(inside, w, 0.0) for w in (a, b, t))
-            mask = mask * inside
+            mask = both(mask, inside)
             a, b = lens.at(a, b, 0, t).value
-        seen = mask if traced.usable is None else mask * traced.usable
+        seen = both(mask, traced.usable)
         focal_x, focal_y, centre_x, centre_y = columns(intrinsics)
         planes = focal_x * a + centre_x, focal_y * b + centre_y
         pixels = torch.stack([replace(seen, w, INVALID_PIXEL) for w in planes])
-        return pixels, seen.expand_as(pixels[0])
+        return pixels, None if seen is None else seen.expand_as(pixels[0])
 
+    order = order_of(order, points, intrinsics, distortion) if looks else order
     pixels, mask = without_keeping(evaluate, *to_planes(points), traced.intrinsics, traced.distortion)
-    return pixels, positive(mask)
+    return pixels, torch.ones_like(pixels[0], dtype=torch.bool) if mask is None else positive(mask)
 
 
 def _keeping(native: Native, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:

@@ -197,11 +197,20 @@ class Traced(NamedTuple):
         return (domain.chart, domain.lens) if domain.is_constant else self.model.optics(columns(distortion))
 
 
-def replace(mask: Tensor, plane: Tensor, value: float) -> Tensor:
-    """Return the plane where the mask is 1, and the value where it is 0."""
-    return torch.where(mask > 0, plane, value)
+def replace(mask: Tensor | None, plane: Tensor, value: float | Tensor) -> Tensor:
+    """Return the plane where the mask is 1, and the value where it is 0; a mask that is None is 1 everywhere."""
+    return plane if mask is None else torch.where(mask > 0, plane, value)
 
 
-def to_mask(margin: Tensor) -> Tensor:
-    """Return 1 for a positive margin, else 0, in its dtype: compiled code writes bools one by one."""
-    return (margin.detach() > 0).to(margin.dtype)
+def to_mask(margin: Tensor, looks: bool = False) -> Tensor | None:
+    """Return 1 for a positive margin, else 0, in its dtype: compiled code writes bools one by one.
+
+    If the call `looks` at values, it is None for margins that are all positive: then nothing is to be replaced.
+    """
+    margin = margin.detach()
+    return None if looks and bool(margin.amin() > 0) else (margin > 0).to(margin.dtype)
+
+
+def both(mask: Tensor | None, other: Tensor | None) -> Tensor | None:
+    """Return the product of two masks."""
+    return other if mask is None else mask if other is None else mask * other

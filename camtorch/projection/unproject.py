@@ -9,6 +9,7 @@ from torch import Tensor
 
 from camtorch.evaluate.export import times
 from camtorch.evaluate.recorded import order_of, positive, to_planes, without_keeping
+from camtorch.evaluate.tensors import may_look_at
 from camtorch.optics.charts import Planes2
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
@@ -16,7 +17,7 @@ from camtorch.projection import native_calls
 from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.native_cameras import Native
 from camtorch.projection.ops import search_in_place, search_open
-from camtorch.projection.rows import CameraRows, Direction, Traced, replace, to_mask
+from camtorch.projection.rows import CameraRows, Direction, Traced, both, replace, to_mask
 from camtorch.projection.solve import search
 from camtorch.values.arguments import columns, present
 
@@ -73,7 +74,7 @@ def _first_image(domain: Domain, u: Tensor, v: Tensor) -> tuple[Found, Tensor]:
     """Return the points that the stages after the first one send to (u, v), and a margin of the image's circle."""
     rest = present(domain.lens.rest, "a later stage")
     within = domain.image_circle_sq - torch.addcmul(u * u, v, v)
-    mask = to_mask(within)
+    mask = to_mask(within, may_look_at(u))
     u, v = replace(mask, u, 0.0), replace(mask, v, 0.0)
     return _newton(rest, u, v, *rest.start(u, v)), within
 
@@ -84,7 +85,7 @@ def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
     radial, table = present(domain.lens.radial, "a radial factor"), present(domain.inverse, "a table")
     possible = times(table.most2, 1 + 8 * eps) - r2
     # points beyond the fold would never converge
-    r2 = torch.minimum(replace(to_mask(possible), r2, 0.0), table.most2)
+    r2 = torch.minimum(replace(to_mask(possible, may_look_at(r2)), r2, 0.0), table.most2)
     scale, converged = solve(radial, table, r2)
     # a ray's rounding must not carry it across the fold
     inside = times(domain.safe_radius_sq, 1 - 32 * eps) - r2 * scale * scale
@@ -92,7 +93,7 @@ def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
 
 
 def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Found:
-    short2, converged = short(u.dtype) ** 2, None
+    short2, converged, looks = short(u.dtype) ** 2, None, may_look_at(u)
     for _ in range(MOST_STEPS):
         at = lens.at(a, b)
         x, y = at.value
@@ -102,6 +103,8 @@ def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Found:
         a, b = a + da, b + db
         t = torch.addcmul(a * a, b, b)
         converged = short2 * (t + 0.01) - torch.addcmul(da * da, db, db)
+        if looks and bool(converged.amin() > 0):
+            break
     converged = present(converged, "a step")
     return Found(a, b, torch.minimum(converged, reciprocal.abs()), torch.ones_like(a))
 
@@ -124,13 +127,14 @@ def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes
     return a, b
 
 
-def _to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...]) -> tuple[Planes2, Tensor]:
+def _to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...], looks: bool) -> tuple[Planes2, Tensor | None]:
     """Return points (p, q) of the sensor in focal lengths, and a mask: 0 for NaN and far pixels, put at the centre."""
     focal_x, focal_y, centre_x, centre_y = intrinsics
     p, q = (u - centre_x) / focal_x, (v - centre_y) / focal_y
     far = torch.maximum(p.detach().abs(), q.detach().abs())
-    mask = (far < torch.finfo(far.dtype).max ** 0.25).to(far.dtype)
-    p, q = ((torch.where(mask > 0, w, c) - c) / f for w, c, f in ((u, centre_x, focal_x), (v, centre_y, focal_y)))
+    mask = to_mask(torch.finfo(far.dtype).max ** 0.25 - far, looks)
+    if mask is not None:
+        p, q = ((torch.where(mask > 0, w, c) - c) / f for w, c, f in ((u, centre_x, focal_x), (v, centre_y, focal_y)))
     return (p, q), mask
 
 
@@ -144,40 +148,42 @@ def _formula(
 ) -> tuple[Tensor, Tensor]:
     """Return rays (3, C, N) for pixels (C, N, 2), and valid (C, N); see `Direction.formula`."""
     traced = Traced.of(model, intrinsics, distortion, cameras)
-    domain = traced.domain
+    domain, looks = traced.domain, may_look_at(pixels, intrinsics, distortion)
+    order = order_of(order, pixels, intrinsics, distortion)
     u, v = to_planes(pixels)
     # the solution has no graph; `attach` gives it derivatives
-    (p, q), mask = _to_target(u.detach(), v.detach(), columns(traced.intrinsics.detach()))
-    mask = mask if traced.usable is None else mask * traced.usable
-    a, b = p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
+    target, mask = _to_target(u.detach(), v.detach(), columns(traced.intrinsics.detach()), looks)
+    mask = both(mask, traced.usable)
+    a, b = p, q = replace(mask, target[0], 0.0), replace(mask, target[1], 0.0)
     if domain.lens.stages:
         found = invert(domain, p, q)
         if domain.is_constant:
             found = _search_recorded(domain, (p, q), found)
         elif torch.compiler.is_compiling():
             search_in_place(model.operator_name, domain.k, p, q, *found)
-        else:
+        elif not (looks and bool(found.solved.amin() > 0)):
             a, b, solved = search_open(model.operator_name, domain.k, p, q, *found)
             found = Found(a, b, solved, found.possible)
-        a, b, solved = found.a, found.b, found.solved
+        a, b, margin = found.a, found.b, found.solved
     else:
-        solved = domain.chart.on_plane(p, q)
-    solved = to_mask(solved)
+        margin = domain.chart.on_plane(p, q)
+    solved = to_mask(margin, looks)
     seen = domain.chart.seen(replace(solved, a, 0.0), replace(solved, b, 0.0))
-    solved = solved if seen is None else solved * to_mask(seen)
-    mask, a, b = mask * solved, replace(solved, a, 0.0), replace(solved, b, 0.0)
+    solved = solved if seen is None else both(solved, to_mask(seen, looks))
+    mask, a, b = both(mask, solved), replace(solved, a, 0.0), replace(solved, b, 0.0)
 
     def evaluate(u: Tensor, v: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:
         chart, lens = traced.optics(distortion)
-        (p, q), _ = _to_target(u, v, columns(intrinsics))
-        p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
-        here = (p, q) if not lens.stages else attach(lens, (a, b), (p, q), order) if order else (a, b)
+        here = a, b
+        if order:
+            here = _to_target(u, v, columns(intrinsics), looks)[0]
+            here = replace(mask, here[0], 0.0), replace(mask, here[1], 0.0)
+            here = attach(lens, (a, b), here, order) if lens.stages else here
         rays = zip(chart.to_ray(*here, order), (0.0, 0.0, 1.0), strict=True)
         return torch.stack([replace(mask, w, axis) for w, axis in rays])
 
-    order = order_of(order, pixels, intrinsics, distortion)
     rays = without_keeping(evaluate, u, v, traced.intrinsics, traced.distortion)
-    return rays, positive(mask.expand_as(a))
+    return rays, torch.ones_like(a, dtype=torch.bool) if mask is None else positive(mask.expand_as(a))
 
 
 def _keeping(native: Native, pixels: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:

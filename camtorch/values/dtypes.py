@@ -44,7 +44,7 @@ def narrow(values: Tensor, dtype: torch.dtype) -> Tensor:
         low, high = torch.iinfo(dtype).min, torch.iinfo(dtype).max
         # float64 does not have the largest int64: the next number would wrap around
         top = float(high) if int(float(high)) == high else math.nextafter(float(high), 0.0)
-        values = values.round().clamp(float(low), top)
+        values = values.round().clamp_(float(low), top)
     return values.to(dtype)
 
 

@@ -81,7 +81,8 @@ def settle(
     """Find out about cells in doubt: polynomials miss most in the middle of a cell and of its sides.
 
     Where half the tolerance is kept there, or an image that ends in zeros is far off, they become `CELL_CUBIC`; or
-    `CELL_QUINTIC`, for polynomials through six nodes; the others are `CELL_TODO`, and so are all if they are few. The target's first row is `first`.
+    `CELL_QUINTIC`, for polynomials through six nodes; the others are `CELL_TODO`, and so are
+    all if they are few. The target's first row is `first`.
     """
     doubt = cells == CELL_DOUBT
     count = int(doubt.sum())
