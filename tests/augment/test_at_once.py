@@ -128,6 +128,23 @@ def test_a_sample_of_a_batch_is_what_it_is_alone(name, dtype):
         assert all(torch.equal(value[i], one[field]) for field, value in batch.items())
 
 
+@pytest.mark.parametrize("batch", [(), (1,)])
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+def test_a_batch_of_one_moves_as_its_sample(name, batch):
+    camera, alone = example("brown_conrady", SIZE).requires_grad_(False), sample_for(torch.float32)
+    augment, together = AUGMENTATIONS[name](), {field: value[None] for field, value in alone.items()}
+    for seed in range(3):  # the first calls make the plans that others keep
+        torch.manual_seed(seed)
+        one = augment(alone, camera=camera)
+        torch.manual_seed(seed)
+        batched = augment(together, camera=camera.expand(*batch))
+        ours, its = batched.pop("camera"), one.pop("camera")
+        assert ours.batch_shape == (1,)
+        assert torch.equal(ours.intrinsics[0], its.intrinsics)
+        assert torch.equal(ours.distortion[0], its.distortion)
+        assert all(torch.equal(value[0], one[field]) for field, value in batched.items())
+
+
 ANGLES = 0, 1e-30, 1e-8, 1e-3, 0.09, 0.11, 1, 2, math.pi - 1e-3, math.pi - 1e-7, math.pi, 4
 
 

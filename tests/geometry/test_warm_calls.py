@@ -17,6 +17,7 @@ pytestmark = pytest.mark.skipif(not native_available(), reason="needs the compil
 # files, functions
 MOST = {"project": (4, 16), "unproject": (5, 18)}
 ROOT = Path(ct.__file__).parent
+MORE = 8  # calls of torch, for the dim of a batch of one
 
 
 def entered(function, *arguments):
@@ -87,3 +88,21 @@ def test_an_augmentation_takes_few_calls_of_torch():
     image = torch.zeros(8, 1, 480, 640, dtype=torch.uint8)
     sample = {"image": image, "mask": image, "keypoints": torch.rand(8, 68, 2) * 400}
     assert median_of_calls(lambda: augmentation(sample)) <= 400
+
+
+def test_a_batch_of_one_takes_as_few_calls_of_torch_as_its_sample():
+    camera = ct.BrownConrady([200.0, 200, 63.5, 63.5], [-0.1, 0.02, 0, 0], image_size=(128, 128)).requires_grad_(False)
+    augmentation = ct.augment.RandomCamera()
+    sample = {"image": torch.zeros(3, 128, 128, dtype=torch.uint8), "keypoints": torch.rand(68, 2) * 100}
+    batch = {name: value[None] for name, value in sample.items()}
+    least = median_of_calls(lambda: augmentation(sample, camera=camera))
+    batches = camera.expand(1)
+    assert median_of_calls(lambda: augmentation(batch, camera=batches)) <= least + MORE
+
+
+def test_a_warp_takes_as_few_calls_of_torch_with_a_batch_of_one():
+    camera = ct.BrownConrady([200.0, 200, 63.5, 63.5], [-0.1, 0.02, 0, 0], image_size=(128, 128)).requires_grad_(False)
+    pixels, rotation = torch.rand(68, 2) * 100, torch.eye(3)
+    least = median_of_calls(lambda: ct.Warp(camera, camera, rotation).transform_points(pixels))
+    batch = camera.expand(1), camera.expand(1), rotation[None]
+    assert median_of_calls(lambda: ct.Warp(*batch).transform_points(pixels[None])) <= least + MORE
