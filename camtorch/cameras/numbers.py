@@ -70,35 +70,44 @@ def checked_numbers(
 
 
 def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: Any) -> _Checked | None:
-    """Return `checked_numbers` for lists and plain tensors of one camera that are right at a glance, or None."""
+    """Return `checked_numbers` for lists of a camera, or plain tensors of some, that are right at a glance, or None."""
     if not (model.always_defined and are_free(*[value for value in (intrinsics, distortion) if type(value) is Tensor])):
         return None
     made: list[Tensor] = []
-    rows: list[list[float]] = []
+    tables: list[Rows] = []
     for value in (intrinsics, distortion):
         if type(value) is list and _NUMBERS.issuperset(map(type, value)):
-            tensor, row = torch.empty(len(value)), value
+            tensor, rows = torch.empty(len(value)), [value]
+            tensor.numpy()[:] = value  # takes half the time of torch.tensor
         elif type(value) is Tensor and value.ndim == 1 and not value.requires_grad:
-            tensor, row = value.clone(), value.tolist()
+            tensor, rows = value.clone(), [value.tolist()]
+        elif type(value) is Tensor and value.ndim == 2 and 0 < len(value) <= _LOOKED_AT and not is_predicted(value):
+            tensor, rows = value.clone(), value.tolist()
         elif value is None and not model.default_count and made:
-            tensor, row = made[0].new_empty(0), []
+            rows = [[]] * len(tables[0])
+            tensor = made[0].new_empty(0) if made[0].ndim == 1 else made[0].new_empty(len(rows), 0)
         else:
             return None
-        if not (tensor.dtype in _DTYPES and tensor.is_cpu and sum(map(abs, row)) < (_SIZE_LIKE if made else _LARGE)):
+        if not (tensor.dtype in _DTYPES and tensor.is_cpu):
             return None
-        if row is value:
-            tensor.numpy()[:] = row  # takes half the time of torch.tensor
-        made.append(nn.Parameter(tensor) if row else tensor)
-        rows.append(row)
-    names = _names_of(model, len(rows[1]))  # type: ignore[arg-type]  # a class can be hashed
-    if len(rows[0]) != 4 or not min(rows[0][:2]) > 0 or names is None:
+        most = _SIZE_LIKE if made else _LARGE
+        for row in rows:
+            if not sum(map(abs, row)) < most:
+                return None
+        made.append(nn.Parameter(tensor) if rows[0] else tensor)
+        tables.append(rows)
+    numbers, k = tables
+    names = _names_of(model, len(k[0]))  # type: ignore[arg-type]  # a class can be hashed
+    if len(numbers[0]) != 4 or made[0].ndim != made[1].ndim or len(numbers) != len(k) or names is None:
         return None
-    if size is not None:
-        if not (type(size) is tuple and len(size) == 2 and type(size[0]) is type(size[1]) is int and min(size) > 0):
+    if size is not None and not (
+        type(size) is tuple and len(size) == 2 and type(size[0]) is type(size[1]) is int and min(size) > 0
+    ):
+        return None
+    for fx, fy, cx, cy in numbers:
+        if not (fx > 0 and fy > 0 and (size is None or _off_centre(cx, cy, size) <= _CENTRED)):
             return None
-        if not _off_centre(rows[0][2], rows[0][3], size) <= _CENTRED:
-            return None
-    return made[0], made[1], names, torch.Size(), size
+    return made[0], made[1], names, made[0].shape[:-1], size
 
 
 _names_of = functools.lru_cache(maxsize=256)(lambda model, count: model.names_of(count))

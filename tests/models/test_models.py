@@ -8,6 +8,7 @@ import torch
 from cameras import KEYS, RANGES, fan, one, pixel_lattice, spread
 
 import camtorch as ct
+from camtorch.cameras.numbers import check_fast, checked_numbers
 
 INTRINSICS = torch.tensor([310.0, 315.0, 318.5, 242.25], dtype=torch.float64)
 
@@ -169,3 +170,18 @@ def test_the_angles_of_a_table_do_not_learn():
 def test_the_laws_have_numbers_to_try_a_model_on(key):
     if one(key).distortion_names:
         assert key in RANGES, "tests/cameras.py says in RANGES how far its coefficients go"
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (8,)])
+def test_numbers_that_are_right_at_a_glance_are_those_that_are_checked(batch):
+    numbers, k = torch.tensor([200.0, 210, 60, 50]).expand(*batch, 4), torch.zeros(*batch, 5)
+    given = ct.BrownConrady, numbers, k, (100, 120)
+    fast, slow = check_fast(*given), checked_numbers(*given)
+    assert fast is not None
+    assert all(map(torch.equal, fast[:2], slow[:2]))
+    assert fast[2:] == slow[2:]
+    wrong = numbers.clone()
+    wrong.view(-1, 4)[-1, 0] = -1
+    assert check_fast(ct.BrownConrady, wrong, k, (100, 120)) is None
+    with torch.no_grad():  # a batch that a network may have predicted is not checked
+        assert (check_fast(ct.BrownConrady, numbers, k, (100, 120)) is None) == bool(batch)
