@@ -23,18 +23,23 @@ from torch import Tensor
 
 from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.change import Change
+from camtorch.augment.change import Change, Drawn, Part
 from camtorch.augment.containers import KIND, Params, camera_of, kind_of_camera, with_boxes, with_cameras
 from camtorch.augment.front_end import FrontEnd, check_front_end, check_single
-from camtorch.augment.kornia_parts import transform_output_shape
+from camtorch.augment.kornia_parts import input_metadata_only, transform_output_shape
 from camtorch.augment.matrices import Guess
 from camtorch.augment.sample import detached, on_samples
 from camtorch.cameras.camera import Camera
+from camtorch.cameras.mixed import kind
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import known_false
+from camtorch.models import Pinhole
+from camtorch.optics.radial_inverse import precise
 from camtorch.values.arguments import as_part, no_camera
 from camtorch.values.dtypes import narrow, widen
+from camtorch.warp.affine import AffineWarp, MirrorWarp
 from camtorch.warp.sampling import Mode
+from camtorch.warp.warp import Warp
 
 Flags: TypeAlias = dict[str, Any]
 _BACK = "back"  # the flag for moving back
@@ -64,8 +69,9 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
         - masks take the nearest value, or the augmentation's `mask_fill` for nothing, and never the colours and the
           light of the lens. ``extra_args={DataKey.MASK: {"resample": "bilinear"}}`` is for soft masks.
         - in a dict (``data_keys=None``) fields that kornia does not know move by their names, see the module.
-        - the warp is no matrix: ``transform_matrix`` is NaN, also in a container that holds the augmentation. ``last``
-          and ``change(params)`` give the cameras before and after, and the rotation.
+        - ``transform_matrix`` is exact if the move is a homography: flips, sizes and crops of any lens, and turns
+          between pinhole cameras. For other lenses it is NaN, also in a container that holds the augmentation.
+          ``last`` and ``change(params)`` give the cameras before and after, and the rotation.
         - ``inverse`` moves everything back by the inverse warp. Pixels that left the image, or fell between its pixels,
           are lost; boxes have grown; chromatic aberration and vignetting stay.
         - params are tensors, drawn on the CPU wherever the module is. A replay is bit-identical.
@@ -73,6 +79,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
 
     augmentation: Augmentation
     camera: Camera | Guess
+    _compute_matrix_lazily = True  # when somebody reads it
 
     def __init__(
         self,
@@ -232,12 +239,14 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     def inverse_boxes(self, input: Any, params: Params, flags: Flags, transform: Any = None, **_: Any) -> Boxes:
         return self.apply_transform_box(input, params, {_BACK: True})
 
+    @input_metadata_only
     def compute_transformation(self, input: Tensor, params: Params, flags: Flags) -> Tensor:
-        """Return (B, 3, 3) of NaN: there is no matrix, and an identity would be silently wrong."""
-        return torch.full((input.shape[0], 3, 3), torch.nan, device=input.device, dtype=input.dtype)
+        """Return (B, 3, 3): the homographies by which pixels move, and NaN for moves that are none."""
+        still = torch.eye(3, device=input.device, dtype=input.dtype).expand(len(input), 3, 3)
+        return self._move(still, params, {}, lambda change, rows: change.each(rows, _homographies))[0]
 
     def compute_inverse_transformation(self, transform: Tensor) -> Tensor:
-        return transform
+        return narrow(torch.linalg.inv_ex(widen(transform))[0], transform.dtype)  # NaN stays, without an error
 
     def __getstate__(self) -> dict[str, Any]:
         # params of a graph could be neither copied nor pickled
@@ -246,6 +255,22 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     def __repr__(self) -> str:
         ranges = "".join(f"{name}={interval}, " for name, interval in self.augmentation.ranges.items())
         return super().__repr__().replace("(", f"({ranges}", 1)
+
+
+def _homographies(part: Part, rows: Tensor) -> Tensor:
+    """Return the homographies (n, 3, 3) from pixels to new pixels, as many as `rows`; NaN for moves that are none."""
+    moves = part.moves
+    if isinstance(moves, AffineWarp):
+        last = moves.matrix.new_tensor([0.0, 0.0, 1.0]).expand(*moves.matrix.shape[:-2], 1, 3)
+        return torch.cat((moves.matrix, last), -2).expand_as(rows)
+    before, after, turn = part.camera, part.target, part.rotation
+    plain = isinstance(moves, Drawn) or type(moves) in (Warp, MirrorWarp)  # others move by depth or by row
+    if not plain or kind(before)[:2] != kind(after)[:2] or not (turn is None or isinstance(after, Pinhole)):
+        return torch.full_like(rows, torch.nan)
+    turned = torch.linalg.inv_ex(precise(before.K))[0]
+    turned = turned if turn is None else turn.to(turned) @ turned
+    lens = (after.distortion == before.distortion).all(-1)[..., None, None]
+    return torch.where(lens, precise(after.K) @ turned, torch.nan).expand_as(rows)
 
 
 class _Random(CameraAugmentation):

@@ -8,6 +8,7 @@ import torch
 
 try:
     from kornia.augmentation import AugmentationSequential, GeometricAugmentationBase2D
+    from kornia.augmentation._2d.base import _input_metadata_only as input_metadata_only
     from kornia.augmentation.base import _BasicAugmentationBase as BasicAugmentationBase
     from kornia.augmentation.container.params import ParamItem
     from kornia.augmentation.utils import _transform_output_shape as transform_output_shape
@@ -17,7 +18,10 @@ except ImportError as error:
     LACK = str(error)
 else:
     _NEEDED = (
-        (GeometricAugmentationBase2D(), "_blend_by_prob _gate _params forward_parameters transform_tensor"),
+        (
+            GeometricAugmentationBase2D(),
+            "_blend_by_prob _compute_matrix_lazily _gate _params forward_parameters transform_tensor",
+        ),
         (AugmentationSequential(), "_params _preproc_boxes _read_datakeys_from_dict autofill_dim forward_parameters"),
         (Boxes(torch.zeros(1, 1, 4, 2)), "_data _valid"),
         (Keypoints(torch.zeros(1, 1, 2)), "_data"),
@@ -30,4 +34,4 @@ if LACK:
         f"{LACK}. Type pip install 'kornia==0.9.*'"
     )
 
-__all__ = ["BasicAugmentationBase", "ParamItem", "transform_output_shape"]
+__all__ = ["BasicAugmentationBase", "ParamItem", "input_metadata_only", "transform_output_shape"]

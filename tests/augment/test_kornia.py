@@ -168,13 +168,28 @@ def test_inverse(cls):
     assert torch.isfinite(seq[0].inverse(smooth)).all()
 
 
-def test_params_can_be_edited_and_there_is_no_matrix():
+MOVES = augment.RandomMount(camera=60, p=0.5), augment.HorizontalFlip(camera=camera()), augment.Resize(40, camera=60)
+
+
+@pytest.mark.parametrize("augmentation", MOVES, ids=lambda one: type(one).__name__)
+def test_the_matrix_is_that_of_the_move_if_it_is_a_homography(augmentation):
+    parts = adapter.CameraAugmentation(augmentation), K.RandomAffine(9.0, p=1.0)
+    seq = K.AugmentationSequential(*parts, data_keys=["input", "keypoints"])
+    moved, matrix = seq(images(), points())[1], seq.transform_matrix
+    expected = (torch.cat((points(), torch.ones_like(points()[..., :1])), -1) @ matrix.mT).unflatten(-1, (3,))
+    seen = (moved != -1).all(-1)
+    torch.testing.assert_close(moved[seen], (expected[..., :2] / expected[..., 2:])[seen], atol=1e-3, rtol=0)
+    back = parts[0].compute_inverse_transformation(parts[0].transform_matrix)
+    torch.testing.assert_close(back @ parts[0].transform_matrix, torch.eye(3).expand(3, 3, 3), atol=1e-4, rtol=0)
+
+
+def test_params_can_be_edited_and_a_turned_lens_has_no_matrix():
     aug = adapter.RandomCamera(camera())
     seq = K.AugmentationSequential(aug, K.RandomAffine(10.0, p=1.0))
     seq(images())
     assert seq.transform_matrix.shape == (3, 3, 3)
     assert seq.transform_matrix.isnan().all()
-    assert aug.compute_inverse_transformation(seq.transform_matrix) is seq.transform_matrix
+    assert aug.compute_inverse_transformation(seq.transform_matrix).isnan().all()
     warped, params = aug(images()), dict(aug._params)
     assert all(len(value) == 3 for name, value in params.items() if name != "forward_input_shape")
     params["yaw"] = params["yaw"] + 5
