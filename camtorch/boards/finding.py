@@ -49,7 +49,8 @@ def find_board(images: Any, board: Any, *, square: float = 1.0, **options: Any) 
 
         found = ct.find_board("photos/*.jpg", "9x6", square=0.024)
         points = found.object_points, found.image_points
-        calibration = ct.calibrate("kannala_brandt", *points, image_size=found.image_size)
+        size = found.image_size
+        calibration = ct.calibrate("kannala_brandt", *points, image_size=size)
 
     Files are read as stored, without their Exif orientation, since a camera describes stored pixels. Images without the
     board, unreadable ones, and those of a rarer size are left out; one warning names them. It needs OpenCV.

@@ -121,7 +121,8 @@ class MapBatches(Mover):
     """Augmentation or warp of batches of rows: a function for Ray Data's `map_batches` and similar callers.
 
         rows = ray.data.read_images("images/", include_paths=True)
-        rows = rows.map_batches(ct.data.MapBatches(augment, key="path", seed=0), batch_size=32)
+        moved = ct.data.MapBatches(augment, key="path", seed=0)
+        rows = rows.map_batches(moved, batch_size=32)
 
     Columns are arrays (B, ...), or arrays of objects if rows differ in shape, with the names of the fields of an
     `Augmentation`, without its batch dim:

@@ -11,7 +11,8 @@ from camtorch.optics import Chart, Lens, Unified
 class EUCM(Camera):
     """The extended unified camera model.
 
-        (a, b) = (x, y) / (alpha d + (1 - alpha) z),  d = sqrt(beta (x^2 + y^2) + z^2),  (u, v) = f (a, b) + c
+        (a, b) = (x, y) / (alpha d + (1 - alpha) z),  d = sqrt(beta (x^2 + y^2) + z^2)
+        (u, v) = f (a, b) + c
 
     A ray is valid before the pole or the fold of r: for z > -w d, as in `UCM`, which this is for beta = 1. beta is > 0.
 

@@ -14,7 +14,8 @@ class Fisheye624(Camera):
 
     With theta = atan2(hypot(x, y), z), real past 90 degrees:
 
-        r   = theta (1 + k0 theta^2 + k1 theta^4 + ... + k5 theta^12),  (a, b) = r (cos phi, sin phi)
+        r   = theta (1 + k0 theta^2 + k1 theta^4 + ... + k5 theta^12)
+        (a, b) = r (cos phi, sin phi)
         a' = a + p0 (2 a^2 + r^2) + 2 p1 a b + s0 r^2 + s1 r^4
         b' = b + p1 (2 b^2 + r^2) + 2 p0 a b + s2 r^2 + s3 r^4
 

@@ -11,7 +11,8 @@ from camtorch.optics import Chart, Lens, Unified
 class UCM(Camera):
     """The unified camera model, in the form with alpha; for catadioptric and for fisheye cameras.
 
-        (a, b) = (x, y) / (alpha d + (1 - alpha) z),  d = sqrt(x^2 + y^2 + z^2),  (u, v) = f (a, b) + c
+        (a, b) = (x, y) / (alpha d + (1 - alpha) z),  d = sqrt(x^2 + y^2 + z^2)
+        (u, v) = f (a, b) + c
 
     A ray is valid before the pole or the fold of r: for z > -w d with w = alpha / (1 - alpha) up to alpha = 1/2, where
     the camera sees all directions but the exact backward one, and (1 - alpha) / alpha from there on. alpha = 0 is a

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 class PositiveFocal(nn.Module):
     """Focal lengths that remain positive in every step of an optimizer: the logarithms of fx and fy learn.
 
-        torch.nn.utils.parametrize.register_parametrization(camera, "intrinsics", PositiveFocal())
+        register = torch.nn.utils.parametrize.register_parametrization
+        register(camera, "intrinsics", PositiveFocal())
 
     An optimizer's step of 0.01 is one percent of a focal length; the principal point learns in pixels.
     """

@@ -155,7 +155,8 @@ class ShutterWarp(MirrorWarp):
     Cameras and rotation are those of the middle of the readout. Images, points and boxes move by the row that sees
     them; rays turn by the rotation alone.
 
-        straight = ct.ShutterWarp(camera, ct.Dewarp(camera).target, shutter=ct.RollingShutter(0.015, [0.3, -1.2, 0.5]))
+        shutter = ct.RollingShutter(0.015, [0.3, -1.2, 0.5])
+        straight = ct.ShutterWarp(camera, ct.Dewarp(camera).target, shutter=shutter)
         images = straight(images)
 
     Args:
