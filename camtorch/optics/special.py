@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.export import atan2, plus
+from camtorch.evaluate.tensors import may_look_at
 
 # Below these the power series is used. Its first dropped term is below 1e-21, and above them the closed form still has
 # a first derivative accurate to 1e-13 of the function's own scale.
@@ -29,10 +30,29 @@ def _series(t: Tensor, coefficients: list[float]) -> Tensor:
     return result
 
 
-def _blend(t: Tensor, series: list[float], closed_form: Callable[[Tensor], Tensor]) -> Tensor:
-    small = t < _SMALL_ANGLE2
-    large = closed_form(torch.where(small, 1.0, t).sqrt())
-    return torch.where(small, _series(torch.where(small, t, 0.0), series), large)
+def _blend(
+    small: Tensor,
+    near: Callable[..., Tensor],
+    far: Callable[..., Tensor],
+    planes: tuple[Tensor, ...],
+    in_near: tuple[float, ...],
+    in_far: tuple[float | None, ...],
+) -> Tensor:
+    """Return `near` of planes where they are small, else `far`; each sees numbers, or None: the plane, elsewhere."""
+    looks = may_look_at(small, *planes)
+    places = small.nonzero(as_tuple=True) if looks else ()
+    if looks and not len(places[0]):
+        return far(*planes)
+    large = far(*(p if w is None else torch.where(small, w, p) for w, p in zip(in_far, planes, strict=True)))
+    if looks:  # mostly few are small
+        return large.index_put(places, near(*(p[places] for p in planes)))
+    return torch.where(small, near(*(torch.where(small, p, w) for w, p in zip(in_near, planes, strict=True))), large)
+
+
+def _blend_series(t: Tensor, series: list[float], closed_form: Callable[[Tensor], Tensor]) -> Tensor:
+    return _blend(
+        t < _SMALL_ANGLE2, lambda t: _series(t, series), lambda t: closed_form(t.sqrt()), (t,), (0.0,), (1.0,)
+    )
 
 
 def root(square: Tensor) -> Tensor:
@@ -50,13 +70,13 @@ _ATAN = [(-1) ** n / (2 * n + 1) for n in range(8)]
 
 def cos_root(t: Tensor, order: int = 2) -> Tensor:
     """Return cos(theta) for t = theta^2."""
-    return _blend(t, _COS, torch.cos) if order > 1 else torch.cos(root(t))
+    return _blend_series(t, _COS, torch.cos) if order > 1 else torch.cos(root(t))
 
 
 def sinc_root(t: Tensor, order: int = 2) -> Tensor:
     """Return sin(theta) / theta for t = theta^2."""
     if order > 1:
-        return _blend(t, _SINC, lambda angle: torch.sin(angle) / angle)
+        return _blend_series(t, _SINC, lambda angle: torch.sin(angle) / angle)
     angle = root(t)
     return torch.sin(angle) / angle
 
@@ -68,7 +88,7 @@ def cosc_root(t: Tensor) -> Tensor:
         ratio = torch.sin(angle / 2) / angle
         return 2 * ratio * ratio
 
-    return _blend(t, _COSC, half_angle)
+    return _blend_series(t, _COSC, half_angle)
 
 
 def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:
@@ -79,16 +99,22 @@ def angle_per_radius(rho2: Tensor, z: Tensor, order: int = 2) -> Tensor:
     if order <= 1:
         rho = root(rho2)
         return atan2(rho, z) / rho
+
+    def near(rho2: Tensor, z: Tensor) -> Tensor:
+        reciprocal = 1 / z
+        return reciprocal * _series(rho2 * reciprocal * reciprocal, _ATAN)
+
+    def far(rho2: Tensor, z: Tensor) -> Tensor:
+        rho = rho2.sqrt()
+        return atan2(rho, z) / rho
+
     small = (z > 0) & (rho2 < _SMALL_SLOPE2 * z * z)
-    reciprocal = 1 / torch.where(small, z, 1.0)
-    near = reciprocal * _series(torch.where(small, rho2, 0.0) * reciprocal * reciprocal, _ATAN)
-    rho = torch.where(small, 1.0, rho2).sqrt()
-    return torch.where(small, near, atan2(rho, z) / rho)
+    return _blend(small, near, far, (rho2, z), (0.0, 1.0), (1.0, None))
 
 
 def tanc_root(t: Tensor) -> Tensor:
     """Return tan(angle) / angle for t = angle^2."""
-    return _blend(t, _TANC, lambda angle: torch.tan(angle) / angle)
+    return _blend_series(t, _TANC, lambda angle: torch.tan(angle) / angle)
 
 
 def first_root(*coefficients: Tensor) -> Tensor:

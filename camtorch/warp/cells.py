@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import reduce
+from functools import lru_cache, reduce
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -147,11 +147,18 @@ def lay_quintics(nodes: Tensor, cells: Tensor, count: int) -> Tensor:
     if not len(place):
         return nodes.new_empty(2, 0, STEP, STEP)
     cells[some] = torch.arange(count, count + len(place), dtype=cells.dtype, device=cells.device)
-    t, steps = torch.arange(STEP, dtype=torch.float64)[:, None] / STEP + 2, range(6)
-    weights = torch.cat([reduce(torch.mul, [(t - k) / (j - k) for k in steps if k != j]) for j in steps], -1)  # (8, 6)
+    weights = _quintics()
     # torch may be told to multiply matrices of less than float64 in fewer bits
     around = _around(nodes, camera, place).double()
     return (weights @ around @ weights.mT).to(nodes.dtype).transpose(0, 1)
+
+
+@lru_cache(maxsize=1)
+def _quintics() -> Tensor:
+    """Return weights (8, 6) of six nodes in their quintic, on the way from the third to the fourth one; on the CPU."""
+    with torch.inference_mode(False):
+        t, steps = torch.arange(STEP, dtype=torch.float64, device="cpu")[:, None] / STEP + 2, range(6)
+        return torch.cat([reduce(torch.mul, [(t - k) / (j - k) for k in steps if k != j]) for j in steps], -1)
 
 
 def _around(nodes: Tensor, camera: Tensor, place: Tensor) -> Tensor:
