@@ -18,6 +18,7 @@ from camtorch.cameras.freezing import INTRINSICS, PREFIX, Freezable, all_frozen,
 from camtorch.cameras.kornia import to_kornia
 from camtorch.cameras.numbers import camera_of_fov, check_fast, checked_numbers, numbers_of_matrix, replaced
 from camtorch.convert.result import Conversion
+from camtorch.evaluate.door import refuse_jit_trace
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import is_predicted, values_of
 from camtorch.optics.model_spec import ModelSpec
@@ -402,6 +403,7 @@ class Camera(Freezable, Editable):
     def size_for(self, what: str) -> tuple[int, int]:
         """Return the image_size; raise if it is None."""
         if self.image_size is None:
+            refuse_jit_trace()
             raise ValueError(f"{type(self).__name__}: image_size must be (height, width) for {what}; got None")
         return self.image_size
 

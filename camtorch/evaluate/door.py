@@ -82,6 +82,17 @@ def is_recorded() -> bool:
 in_jit_trace: Callable[[], bool] = torch.jit.is_tracing  # type: ignore[attr-defined]
 """Whether torch.jit.trace is running."""
 
+
+def refuse_jit_trace() -> None:
+    """Raise a RuntimeError while torch.jit.trace is running."""
+    # before it runs a module, it reads all properties
+    if in_jit_trace() or torch.jit._trace._trace_module_map is not None:
+        raise RuntimeError(
+            "camtorch: cameras must not project in torch.jit.trace; got a call that does. Use torch.export.export("
+            "module, inputs), or torch.onnx.export(module, inputs, dynamo=True). Frozen warps of images can be traced"
+        )
+
+
 is_exporting: Callable[[], bool] = torch.compiler.is_exporting
 """Whether the traced program is for another runtime, which has no operators of our own."""
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from camtorch.evaluate.door import in_transform, is_eager, is_for_here, keeps_graph
+from camtorch.evaluate.door import in_transform, is_eager, is_for_here, keeps_graph, refuse_jit_trace
 
 Result = TypeVar("Result")
 
@@ -75,6 +75,7 @@ def power_of_two(size: Tensor) -> Tensor:
         return size
     if in_transform():  # torch.vmap cannot read bits before torch 2.11
         return size / torch.frexp(size).mantissa / 2
+    refuse_jit_trace()  # which takes no view of another dtype
     exponent, integer = (0x7F800000, torch.int32) if size.dtype == torch.float32 else (0x7FF << 52, torch.int64)
     return (size.view(integer) & exponent).view(size.dtype)
 

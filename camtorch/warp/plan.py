@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from functools import partial
 from typing import Any, ClassVar, Literal
 
@@ -299,14 +300,15 @@ class CameraPair(GeometryModule):
                 raise RuntimeError(
                     "Warp: cameras must not learn in torch.jit.trace and torch.onnx.export(dynamo=False); got some "
                     "that do. Use torch.onnx.export(dynamo=True) or torch.export; or make the map a constant by "
-                    "warp.requires_grad_(False) and one call before"
+                    "warp.requires_grad_(False)"
                 )
             return self.locate(range(self.target.size_for("Warp")[0]), self._reach(padding), self.tolerance)
         if records_constants() and (constant := self._constant(padding)):
             return constant
         reach, tolerance = self._reach(padding), self.tolerance
         compute = partial(self.computed, reach, tolerance)
-        return self._plan().positions_for(reach if tolerance else "zeros", compute)
+        with set_aside() if in_jit_trace() else nullcontext():  # a constant of the trace
+            return self._plan().positions_for(reach if tolerance else "zeros", compute)
 
     def _plan(self) -> Plan:
         plan: Plan = self._kept.result
