@@ -78,7 +78,6 @@ def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: 
     for value in (intrinsics, distortion):
         if type(value) is list and _NUMBERS.issuperset(map(type, value)):
             tensor, rows = torch.empty(len(value)), [value]
-            tensor.numpy()[:] = value  # takes half the time of torch.tensor
         elif type(value) is Tensor and value.ndim == 1 and not value.requires_grad:
             tensor, rows = value.clone(), [value.tolist()]
         elif type(value) is Tensor and value.ndim == 2 and 0 < len(value) <= _LOOKED_AT and not is_predicted(value):
@@ -94,6 +93,8 @@ def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: 
         for row in rows:
             if not sum(map(abs, row)) < most:
                 return None
+        if rows[0] is value:
+            tensor.numpy()[:] = value  # takes half the time of torch.tensor
         made.append(nn.Parameter(tensor) if rows[0] else tensor)
         tables.append(rows)
     numbers, k = tables
