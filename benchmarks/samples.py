@@ -3,7 +3,7 @@
 A "driver" also has a mask, a box, a gaze and a head pose; albumentations and torchvision move all but the last two.
 Theirs are affine maps of about the same extent. Beside RandomLens stands albumentations' OpticalDistortion, which moves
 no landmarks here: that would make it many times slower. "Image alone" is a bare affine warp. RandomCamera also moves a
-mask, beside the same by OpenCV: new maps, the image, the mask and the landmarks. One thread.
+mask, beside that affine map, and OpenCV: new maps, the image, the mask and the landmarks. One thread.
 
 Then the workers themselves: samples per second of a DataLoader, of arrays that are in memory already, in batches of 8.
 "nothing done" hands samples on as they are: what the DataLoader itself takes.
