@@ -39,7 +39,7 @@ def _blend(
     in_far: tuple[float | None, ...],
 ) -> Tensor:
     """Return `near` of planes where they are small, else `far`; each sees numbers, or None: the plane, elsewhere."""
-    looks = may_look_at(small, *planes)
+    looks = small.ndim > 0 and may_look_at(small, *planes)
     places = small.nonzero(as_tuple=True) if looks else ()
     if looks and not len(places[0]):
         return far(*planes)
