@@ -158,7 +158,7 @@ typedef struct {
     Move move;
     Classification cells;
     int64_t first_row; /* of the target, where cells begin */
-    int64_t keeps_quintics; /* CELL_QUINTIC stays in `cells`, and has no place in `exact` */
+    int64_t learns; /* CELL_QUINTIC stays in `cells`, without a place in `exact`, where few cells may have one */
     float *narrow;     /* (c, 2, nodes), the nodes in float, or NULL: they are */
     /* (2, c rows columns, 8, 8): positions of all pixels of the cells that `classify` leaves, NaN where there is none,
        and of those around a cell in which what is mapped ends. Each cell gets the number of its place there */

@@ -323,7 +323,7 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
     if ((left = T(settle)(given, b, &asked))) return left;
     int64_t most = 0, found;
     for (int64_t i = 0; i < cells; i++) most += asked.cells[i] == CELL_NEXT;
-    if (8 * most > 7 * cells) return LEFT_MOST;
+    if (given->learns ? 5 * most > cells : 8 * most > 7 * cells) return LEFT_MOST;
     do { /* those that are next turn up ahead, and behind */
         int64_t places[BLOCK / SQUARE];
         int count = 0;
@@ -335,7 +335,7 @@ static int T(lattice)(const Lattices *given, int64_t camera, T(Between) *b) {
             found += count, count = 0;
         }
     } while (found);
-    if (!given->keeps_quintics) T(lay_quintics)(given, &asked);
+    if (!given->learns) T(lay_quintics)(given, &asked);
     return left;
 }
 

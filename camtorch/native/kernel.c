@@ -1852,8 +1852,25 @@ static void lay_weights(int64_t taps, Polynomials weights) {
         }
 }
 
+/* One polynomial is laid for most cells, all at once, and the other one for some */
+typedef struct {
+    Polynomials most, some;
+    int32_t usual, rare; /* the cells of each */
+} Kinds;
+
+static void lay_kinds(const Laying *given, Kinds *kinds) {
+    int64_t i, quintics = 0, cubics = 0;
+    for (i = 0; i < given->count * given->rows * given->columns; i++) {
+        cubics += given->cells[i] == CELL_CUBIC;
+        quintics += given->cells[i] == CELL_QUINTIC;
+    }
+    lay_weights(quintics > cubics ? 6 : 4, kinds->most), lay_weights(quintics > cubics ? 4 : 6, kinds->some);
+    kinds->usual = quintics > cubics ? CELL_QUINTIC : CELL_CUBIC, kinds->rare = CELL_QUINTIC + CELL_CUBIC - kinds->usual;
+}
+
 /* Some rows of cells of a camera, from the one at `first` on */
-static void lay_strip(const Laying *given, const Polynomials w, int64_t b, int64_t first, int64_t end) {
+static void lay_strip(const Laying *given, const Kinds *kinds, int64_t b, int64_t first, int64_t end) {
+    const float(*w)[STEP] = kinds->most, (*r)[STEP] = kinds->some;
     const int64_t width = given->columns + 5, plane = (given->rows + 5) * width, far = given->exact_count * STEP * STEP;
     int64_t column, i, j, y;
     int k, c;
@@ -1887,14 +1904,22 @@ static void lay_strip(const Laying *given, const Polynomials w, int64_t b, int64
                 memcpy(given->mapped + at, mapped, (size_t)n);
                 for (j = 0; j < n; j++) {
                     const int32_t cell = cells[j / STEP];
-                    if (cell == CELL_CUBIC) {
+                    if (cell == kinds->usual) {
                         j += STEP - 1;
-                        continue;
+                    } else if (cell == kinds->rare) {
+                        const float *node = given->nodes + 2 * b * plane + i * width + column + j / STEP;
+                        to[2 * j] = to[2 * j + 1] = 0;
+                        for (c = 0; c < AROUND * AROUND; c++) {
+                            const float weight = r[c / AROUND][part] * r[c % AROUND][j % STEP];
+                            to[2 * j] += weight * node[c / AROUND * width + c % AROUND];
+                            to[2 * j + 1] += weight * node[c / AROUND * width + c % AROUND + plane];
+                        }
+                    } else {
+                        const float *exact = given->exact + (cell * (int64_t)STEP + part) * STEP + j % STEP;
+                        const int known = cell != CELL_EMPTY && exact[0] == exact[0];
+                        to[2 * j] = known ? exact[0] : -9, to[2 * j + 1] = known ? exact[far] : -9;
+                        given->mapped[at + j] = (uint8_t)known;
                     }
-                    const float *exact = given->exact + (cell * (int64_t)STEP + part) * STEP + j % STEP;
-                    const int known = cell != CELL_EMPTY && exact[0] == exact[0];
-                    to[2 * j] = known ? exact[0] : -9, to[2 * j + 1] = known ? exact[far] : -9;
-                    given->mapped[at + j] = (uint8_t)known;
                 }
             }
         }
@@ -1929,9 +1954,11 @@ NOT_INLINE void spread_row(const Polynomials w, int part, const float *from, int
 }
 
 /* The gradients of a camera's nodes and exact positions */
-static void gather(const Laying *given, const Polynomials w, int64_t b) {
+static void gather(const Laying *given, const Kinds *kinds, int64_t b) {
+    const float(*w)[STEP] = kinds->most, (*r)[STEP] = kinds->some;
     const int64_t width = given->columns + 5, plane = (given->rows + 5) * width, far = given->exact_count * STEP * STEP;
     int64_t column, i, j, y;
+    int c;
     for (column = 0; column < given->columns; column += LAID) {
         const int64_t left = given->columns - column, count = left < LAID ? left : LAID, x = column * STEP;
         const int64_t n = given->width - x < count * STEP ? given->width - x : count * STEP;
@@ -1940,20 +1967,28 @@ static void gather(const Laying *given, const Polynomials w, int64_t b) {
         memset(lines, 0, sizeof lines);
         for (i = 0; i < given->rows + AROUND - 1; i++) {
             const int32_t *cells = given->cells + (b * given->rows + i) * given->columns + column;
-            int cubic = 1;
-            for (j = 0; j < count && i < given->rows; j++) cubic &= cells[j] == CELL_CUBIC;
+            int usual = 1;
+            for (j = 0; j < count && i < given->rows; j++) usual &= cells[j] == kinds->usual;
             for (y = i * STEP; y < (i + 1) * STEP && y < given->height; y++) {
                 const int part = (int)(y % STEP);
                 const float *from = given->grid + 2 * ((b * given->height + y) * given->width + x);
-                for (j = 0; j < n && !cubic; j++) {
+                for (j = 0; j < n && !usual; j++) {
                     const int32_t cell = cells[j / STEP];
-                    const int is_cubic = cell == CELL_CUBIC;
-                    own[2 * j] = is_cubic ? from[2 * j] : 0, own[2 * j + 1] = is_cubic ? from[2 * j + 1] : 0;
-                    if (is_cubic || cell == CELL_EMPTY) continue;
-                    float *exact = given->exact + (cell * (int64_t)STEP + part) * STEP + j % STEP;
-                    exact[0] = from[2 * j], exact[far] = from[2 * j + 1];
+                    const int is_usual = cell == kinds->usual;
+                    own[2 * j] = is_usual ? from[2 * j] : 0, own[2 * j + 1] = is_usual ? from[2 * j + 1] : 0;
+                    if (cell == kinds->rare) {
+                        float *node = nodes + i * width + j / STEP;
+                        for (c = 0; c < AROUND * AROUND; c++) {
+                            const float weight = r[c / AROUND][part] * r[c % AROUND][j % STEP];
+                            node[c / AROUND * width + c % AROUND] += weight * from[2 * j];
+                            node[c / AROUND * width + c % AROUND + plane] += weight * from[2 * j + 1];
+                        }
+                    } else if (!is_usual && cell != CELL_EMPTY) {
+                        float *exact = given->exact + (cell * (int64_t)STEP + part) * STEP + j % STEP;
+                        exact[0] = from[2 * j], exact[far] = from[2 * j + 1];
+                    }
                 }
-                spread_row(w, part, cubic ? from : own, 2 * n, lines[i % AROUND], lines[(i + 1) % AROUND],
+                spread_row(w, part, usual ? from : own, 2 * n, lines[i % AROUND], lines[(i + 1) % AROUND],
                            lines[(i + 2) % AROUND], lines[(i + 3) % AROUND], lines[(i + 4) % AROUND], lines[(i + 5) % AROUND]);
             }
             gather_line(w, lines[i % AROUND], count, nodes + i * width, nodes + i * width + plane);
@@ -1964,11 +1999,11 @@ static void gather(const Laying *given, const Polynomials w, int64_t b) {
 void THIS(lay)(Laying *given) {
     const int64_t strips = given->is_transposed ? 1 : (given->rows + LAID_ROWS - 1) / LAID_ROWS;
     int64_t i;
-    Polynomials weights;
-    lay_weights(given->taps, weights);
+    Kinds kinds;
+    lay_kinds(given, &kinds);
     while ((i = __atomic_fetch_add(&given->next, 1, __ATOMIC_RELAXED)) < strips * given->count) {
         const int64_t first = i % strips * LAID_ROWS, end = first + LAID_ROWS;
-        if (given->is_transposed) gather(given, weights, i);
-        else lay_strip(given, weights, i / strips, first, end < given->rows ? end : given->rows);
+        if (given->is_transposed) gather(given, &kinds, i);
+        else lay_strip(given, &kinds, i / strips, first, end < given->rows ? end : given->rows);
     }
 }

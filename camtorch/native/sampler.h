@@ -72,7 +72,8 @@ typedef struct {
 
 /* The positions of pixels by a lattice; or what is transposed: the gradients of its nodes and exact positions by theirs */
 typedef struct {
-    /* (b, component, rows + 5, columns + 5), (b, rows, columns), (component, cell, 8, 8): as of `Job`, without gaps */
+    /* (b, component, rows + 5, columns + 5), (b, rows, columns), (component, cell, 8, 8): as of `Job`, without gaps; cells
+       may be CELL_QUINTIC */
     float *nodes;
     const int32_t *cells;
     float *exact;
@@ -80,7 +81,6 @@ typedef struct {
     float *grid;     /* (b, y, x, component), without gaps */
     uint8_t *mapped; /* (b, y, x): whether there is a position; not of gradients */
     int64_t count, rows, columns, height, width;
-    int64_t taps;          /* nodes of a polynomial along each axis: four, or six */
     int64_t is_transposed; /* nodes are then zeros at first */
     int64_t next;          /* the strip, or if it is transposed the camera, that whoever is free takes */
 } Laying;

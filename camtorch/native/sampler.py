@@ -187,30 +187,30 @@ def maker(images: Tensor, count: int, size: tuple[int, int]) -> Callable[[], Ten
     return functools.partial(torch.empty, shape, dtype=dtype, device="cpu", memory_format=layout(images))
 
 
-def lay(nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int], taps: int) -> tuple[Tensor, Tensor]:
-    """Return positions (B, h, w, 2) of all pixels of a lattice, see `Call`, -9 if there is none; and (B, h, w) bool.
+def lay(nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Return positions (B, h, w, 2) of all pixels of a lattice, -9 if there is none; and bool (B, h, w).
 
-    taps: nodes along each axis that a polynomial is laid through, 4 or 6.
+    It is as in `Call`, and `cells` may be `CELL_QUINTIC`.
     """
     shape = cells.shape[0], *size
     grid, mapped = _room((*shape, 2)), torch.empty(shape, dtype=torch.bool, device="cpu")
-    _lay(nodes.contiguous(), cells, exact, grid, taps, mapped)
+    _lay(nodes.contiguous(), cells, exact, grid, mapped)
     return grid, mapped
 
 
-def lay_vjp(grid: Tensor, cells: Tensor, count: int, taps: int) -> tuple[Tensor, Tensor]:
+def lay_vjp(grid: Tensor, cells: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return the gradients of a lattice's nodes and `count` exact cells by those of its positions (B, h, w, 2)."""
     (cameras, n, m), step = cells.shape, structs.STEP
     nodes = torch.zeros(cameras, 2, n + 5, m + 5, dtype=torch.float32, device="cpu")
     exact = torch.zeros(2, count, step, step, dtype=torch.float32, device="cpu")
-    _lay(nodes, cells, exact, grid.contiguous(), taps, None)
+    _lay(nodes, cells, exact, grid.contiguous(), None)
     return nodes, exact
 
 
-def _lay(nodes: Tensor, cells: Tensor, exact: Tensor, grid: Tensor, taps: int, mapped: Tensor | None) -> None:
+def _lay(nodes: Tensor, cells: Tensor, exact: Tensor, grid: Tensor, mapped: Tensor | None) -> None:
     cells, exact = cells.contiguous(), exact.contiguous()
     call = structs.Laying()
-    (call.count, call.rows, call.columns), call.exact_count, call.taps = cells.shape, exact.shape[1], taps
+    (call.count, call.rows, call.columns), call.exact_count = cells.shape, exact.shape[1]
     call.height, call.width = grid.shape[1:3]
     if (-(-call.height // structs.STEP), -(-call.width // structs.STEP)) != cells.shape[1:]:  # C would read elsewhere
         raise ValueError(f"cells must be those of {tuple(grid.shape[1:3])} pixels; got {tuple(cells.shape[1:])}")

@@ -66,7 +66,7 @@ def _answers(library: Library) -> Iterator[tuple[str, Iterable[float], Iterable[
 
     grid, nodes[50] = (c_float * 128)(), 64  # v at the cell's first corner
     laying = structs.Laying(nodes=at(nodes), cells=at(cells), grid=at(grid), mapped=at(valid), height=8, width=8)
-    laying.count, laying.rows, laying.columns, laying.taps = 1, 1, 1, 4
+    laying.count = laying.rows = laying.columns = 1
     library.camtorch_lay(laying)
     yield "camtorch_lay", grid[:4], (0, 64, 0, 59.0625)
 

@@ -7,7 +7,7 @@ from ctypes import POINTER, c_char_p, c_double, c_int32, c_int64, c_uint32, c_vo
 
 from camtorch.native.structure import Calls, Numbers, Struct
 
-CHECKSUM = 3741858937
+CHECKSUM = 3751767004
 
 UINT8 = 0
 BOOL = 1
@@ -290,7 +290,6 @@ class Laying(Struct):
         ("columns", c_int64),
         ("height", c_int64),
         ("width", c_int64),
-        ("taps", c_int64),
         ("is_transposed", c_int64),
         ("next", c_int64),
     )
@@ -305,7 +304,6 @@ class Laying(Struct):
     columns: int
     height: int
     width: int
-    taps: int
     is_transposed: int
     next: int
 
@@ -522,7 +520,7 @@ class Lattices(Struct):
         ("move", Move),
         ("cells", Classification),
         ("first_row", c_int64),
-        ("keeps_quintics", c_int64),
+        ("learns", c_int64),
         ("narrow", c_void_p),
         ("exact", c_void_p),
         ("used", c_void_p),
@@ -532,7 +530,7 @@ class Lattices(Struct):
     move: Move
     cells: Classification
     first_row: int
-    keeps_quintics: int
+    learns: int
     narrow: int | None
     exact: int | None
     used: int | None

@@ -229,11 +229,11 @@ class Between:
         first_row: int,
         tolerance: float,
         padding: str,
-        keeps_quintics: bool = False,
+        learns: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor] | None:
         """Return the results of `Lattices`, or None if most cells would have positions of their own."""
         made = Lattices(probes, size, self._size, tolerance, padding, self.cameras, first_row, self._move, _kept_memory)
-        made.struct.keeps_quintics = keeps_quintics
+        made.struct.learns = learns
         run, end = loaded().camtorch_lattices, self._end
         left = run_and_follow(run, made.struct, self.cameras, made.counters, self._start, end)
         return None if left else made.results()

@@ -26,7 +26,7 @@ from camtorch.poses.rotations import turn
 from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.native_calls import Between
 from camtorch.values.threads import on_one_thread
-from camtorch.warp.cells import Exact, classify, lay_quintics, places, put, settle
+from camtorch.warp.cells import Exact, classify, lay_quintics, places, prefer_quintics, put, settle
 from camtorch.warp.panorama import goes_round, lengths, off_poles, within_turn
 
 OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
@@ -71,9 +71,9 @@ class Lattice:
     """Where every pixel of a target (h, w) samples the source's image, by `nodes` (B, 2, n + 5, m + 5) of every eighth.
 
     Nodes begin at pixel (-16, -16); a cubic is laid through four along each axis. `cells` (B, n, m) int32 are
-    `CELL_EMPTY`, `CELL_CUBIC`, or a place in `exact` (2, K, 8, 8), positions for each pixel, NaN where none is mapped.
+    `CELL_EMPTY`, `CELL_CUBIC`, or a place in `exact` (2, K, 8, 8), positions for each pixel, NaN where none is mapped;
+    with a graph also `CELL_QUINTIC`, for quintics through six nodes, whose derivatives are as good as exact ones.
 
-    taps: 6 if quintics, through six nodes, are laid instead, for derivatives.
     done: (3, K) the cells of `exact`, in its order; None where `cells` may be looked at.
     """
 
@@ -82,7 +82,6 @@ class Lattice:
     exact: Tensor
     size: tuple[int, int]
     done: Tensor | None = None
-    taps: int = 4
 
     def on(self, device: torch.device) -> Lattice:
         """Send a lattice from the CPU to another device."""
@@ -114,9 +113,9 @@ class Lattice:
             nodes, exact, cells = self.nodes, self.exact, self.cells
             single = nodes.dtype == torch.float32 and self.done is None
             if single and native_available() and is_eager(nodes, exact, cells):
-                grid, seen = _Pixels.apply(nodes, exact, cells, self.size, self.taps)  # type: ignore[no-untyped-call]
+                grid, seen = _Pixels.apply(nodes, exact, cells, self.size)  # type: ignore[no-untyped-call]
             else:
-                grid, seen = _pixel_by_pixel(nodes, exact, cells, self.size, self.taps, self.done)
+                grid, seen = _pixel_by_pixel(nodes, exact, cells, self.size, self.done)
             return Sampling(grid, seen, None)
 
 
@@ -124,12 +123,10 @@ class _Pixels(Function):
     """Positions of a lattice's pixels, and whether there are any, in compiled code; derived again, by torch."""
 
     @staticmethod
-    def forward(
-        ctx: Any, nodes: Tensor, exact: Tensor, cells: Tensor, size: tuple[int, int], taps: int
-    ) -> tuple[Tensor, Tensor]:
-        grid, seen = sampler.lay(nodes, cells, exact, size, taps)
+    def forward(ctx: Any, nodes: Tensor, exact: Tensor, cells: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        grid, seen = sampler.lay(nodes, cells, exact, size)
         ctx.save_for_backward(nodes, exact, cells)
-        ctx.size, ctx.taps = size, taps
+        ctx.size = size
         ctx.mark_non_differentiable(seen)
         return grid, seen
 
@@ -137,20 +134,23 @@ class _Pixels(Function):
     def backward(ctx: Any, by_grid: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         nodes, exact, cells = ctx.saved_tensors
         if not torch.is_grad_enabled() and is_eager(by_grid):
-            return *sampler.lay_vjp(by_grid, cells, exact.shape[1], ctx.taps), None, None, None
+            return *sampler.lay_vjp(by_grid, cells, exact.shape[1]), None, None
         leaves = nodes.detach().requires_grad_(), exact.detach().requires_grad_()
         with torch.enable_grad():  # it is linear
-            grid, _ = _pixel_by_pixel(leaves[0], leaves[1], cells, ctx.size, ctx.taps)
+            grid, _ = _pixel_by_pixel(leaves[0], leaves[1], cells, ctx.size)
         by_nodes, by_exact = torch.autograd.grad(grid, leaves, by_grid, create_graph=True, materialize_grads=True)
-        return by_nodes, by_exact, None, None, None
+        return by_nodes, by_exact, None, None
 
 
 def _pixel_by_pixel(
-    nodes: Tensor, exact: Tensor, cells: Tensor, size: tuple[int, int], taps: int, done: Tensor | None = None
+    nodes: Tensor, exact: Tensor, cells: Tensor, size: tuple[int, int], done: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return positions (B, h, w, 2) of a lattice's pixels, and whether there are any, bool (B, h, w); by torch."""
     (height, width), (_, n, m) = size, cells.shape
-    planes = interpolated(nodes if taps == 6 else nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
+    planes, quintic = interpolated(nodes[:, :, 1:-1, 1:-1], n, m), cells == CELL_QUINTIC  # (B, 2, 8 n, 8 m)
+    if may_look(quintic) and bool(quintic.any()):
+        wide = quintic.repeat_interleave(STEP, 1).repeat_interleave(STEP, 2).unsqueeze(1)
+        planes = torch.where(wide, interpolated(nodes, n, m), planes)
     blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))
     some = cells != CELL_EMPTY
     if not (may_look(some) and bool(some.all())):
@@ -323,7 +323,7 @@ def on_lattice(
     tolerance: float,
     rows: range,
     padding: str,
-    keeps_quintics: bool = False,
+    learns: bool = False,
 ) -> Lattice | None:
     """Return positions within `tolerance` pixels of the exact ones, from a lattice of every eighth pixel.
 
@@ -332,16 +332,16 @@ def on_lattice(
     is mapped. None if that is most of the image. An edge between four nodes alone is not seen. Positions outside of the
     image that the padding does not need keep no tolerance; for "reflection" all do.
 
-    If a camera or the rotation learns, nodes with a graph follow, and quintics everywhere; `keeps_quintics` leaves
-    cells that need them as `CELL_QUINTIC`.
+    If a camera or the rotation learns, its nodes and exact cells are computed again, with a graph. For this `learns`
+    leaves cells that quintics do for `CELL_QUINTIC`, and more than a fifth exact ones are too many.
     """
     tensors = [*source.tensors, *target.tensors, *(() if rotation is None else (rotation,))]
     if keeps_graph(*tensors):
         if not is_eager(*tensors):
             return None
-        with torch.no_grad():
-            found = on_lattice(source, target, rotation, tolerance, rows, padding, keeps_quintics=True)
-        return None if found is None else _with_graph(found, source, target, rotation, rows)
+        with torch.no_grad():  # derivatives tell positions apart that images do not
+            found = on_lattice(source, target, rotation, tolerance / 4, rows, padding, learns=True)
+        return None if found is None else _with_graph(found, source, target, rotation, tolerance, rows)
     like, (height, width) = _like(target), (len(rows), target.size_for("Warp")[1])
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
     if min(n, m) < FEWEST:
@@ -352,7 +352,7 @@ def on_lattice(
     nodes, size = (n + 5) * (m + 5), source.size_for("Warp")
     pixels = (kept_probes if nodes <= MOST_KEPT else kept_probes.__wrapped__)(rows, width, like.dtype)
     if native is not None:
-        made = native.lattices(pixels, (height, width), rows.start, tolerance, padding, keeps_quintics)
+        made = native.lattices(pixels, (height, width), rows.start, tolerance, padding, learns)
         return None if made is None else Lattice(*made, (height, width))
     exact = partial(_positions, source, target, rotation, None)
     positions, mapped = exact(pixels)  # (B, 1, N, 2)
@@ -362,29 +362,31 @@ def on_lattice(
     narrow, limits = lattice.float(), (size, tolerance, padding)
     cells = find(narrow, mapped, rim, (height, width), *limits)
     settle(exact, rows.start, cells, narrow, mapped, *limits)
-    if 8 * int((cells == CELL_TODO).sum((1, 2)).max()) > 7 * n * m:
+    if int((cells == CELL_TODO).sum((1, 2)).max()) > n * m * (1 / 5 if learns else 7 / 8):
         return None
     computed = _compute(exact, rows.start, cells, cells == CELL_TODO, like)
-    if not keeps_quintics:
+    if not learns:
         computed = torch.cat((computed, lay_quintics(lattice, cells, computed.shape[1])), 1)
     return Lattice(lattice, cells, computed, (height, width))
 
 
-def _with_graph(found: Lattice, source: Camera, target: Camera, rotation: Tensor | None, rows: range) -> Lattice:
-    """Return a lattice with the cells of one that was found without a graph."""
+def _with_graph(
+    found: Lattice, source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, rows: range
+) -> Lattice:
+    """Return a lattice that was found without a graph with one, by quintics wherever they agree with cubics."""
     exact, (height, width), cells = partial(_positions, source, target, rotation, None), found.size, found.cells
     like, (_, n, m) = _like(target), cells.shape
     count = (n + 5) * (m + 5)
     pixels = (kept_probes if count <= MOST_KEPT else kept_probes.__wrapped__)(rows, width, like.dtype)
-    positions, mapped = exact(pixels[:, :count])
-    nodes, computed = positions[:, 0].movedim(-1, 1).unflatten(2, (n + 5, m + 5)), like.new_empty(2, 0, STEP, STEP)
-    # quintics reach one node further than cubics
-    end = F.max_pool2d((~mapped).view(-1, n + 5, m + 5).to(like.dtype), 6, 1) > 0
-    todo = (cells >= 0) | ((cells == CELL_CUBIC) & end)
-    cells.masked_fill_(cells == CELL_QUINTIC, CELL_CUBIC)
+    nodes = exact(pixels[:, :count])[0][:, 0].movedim(-1, 1).unflatten(2, (n + 5, m + 5))
+    if not nodes.requires_grad:
+        cells.masked_fill_(cells == CELL_QUINTIC, CELL_TODO)
+    computed, todo = like.new_empty(2, 0, STEP, STEP), cells >= 0
     if bool(todo.any()):
         computed = _compute(exact, rows.start, cells, todo, like)
-    return Lattice(nodes, cells, computed, (height, width), taps=6)
+    if nodes.requires_grad:
+        prefer_quintics(nodes.detach(), cells, source.size_for("Warp"), tolerance)
+    return Lattice(nodes, cells, computed, (height, width))
 
 
 def coarse(size: tuple[int, ...]) -> tuple[int, int]:

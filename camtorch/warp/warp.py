@@ -78,7 +78,7 @@ class Warp(CameraPair):
         tolerance: the largest error of sampling positions, in pixels of the source. Above zero they come from a lattice
             of every eighth pixel, several times as fast for new cameras; positions out of its reach are computed. By
             default 0.001 between cameras in float32, whose rounding costs as much, and zero in float64. Points, boxes
-            and rays, warps with a graph and warps on a GPU, but those of augmentations, are always exact.
+            and rays, and warps on a GPU, but those of augmentations, are always exact.
 
     A panorama of a whole turn goes on beyond its seam and poles: an `Equirectangular` or `Cylindrical` source as wide
     as 2 pi, or a `LatLon` or `TransverseCylindrical` one as tall, to 0.05 pixels, for all cameras of a batch; this

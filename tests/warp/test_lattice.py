@@ -1,16 +1,21 @@
 """Laws of positions from a lattice: they keep their tolerance, and lose no pixel."""
 
+import itertools
 import json
+import math
 from pathlib import Path
 
 import pytest
 import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from cameras import RARE_ARE_SLOW, each_kind, make, real, turn
 
 import camtorch as ct
 from camtorch.native import sampler
 from camtorch.native.library import native_available
+from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_QUINTIC
 from camtorch.warp import cells, grid
+from camtorch.warp.grid import Lattice
 
 TOLERANCES = (0.1, 0.01)
 
@@ -29,9 +34,12 @@ def check(source, target, rotation):
     """Positions on the image, or of which one is, differ by no more than the tolerance; mapped are the same."""
     exact = ct.Warp(source, target, rotation).by_pixel()
     half = torch.tensor(source.image_size[::-1]) / 2
-    for tolerance in TOLERANCES:
-        close = ct.Warp(source, target, rotation, tolerance=tolerance).by_pixel()
-        assert torch.equal(exact.mapped, close.mapped)
+    learning = source.clone().requires_grad_()
+    alone = ct.Warp(learning, target, rotation, tolerance=0).by_pixel()
+    for tolerance, given in itertools.product(TOLERANCES, (source, learning)):
+        close = ct.Warp(given, target, rotation, tolerance=tolerance).by_pixel()
+        assert close.grid.requires_grad == (given is learning)
+        assert torch.equal((alone if given is learning else exact).mapped, close.mapped)
         on_image = (exact.grid.abs() <= 1).all(-1) | (close.grid.abs() <= 1).all(-1)
         error = ((exact.grid - close.grid) * half).norm(dim=-1)[exact.mapped & on_image]
         assert error.numel() == 0 or error.max() <= tolerance
@@ -128,3 +136,82 @@ def test_points_of_a_pinned_warp_are_those_of_its_cameras_and_learn_with_them():
     moved, valid = pinned.transform_points(pixels)
     moved[valid].sum().backward()
     assert source.intrinsics.grad.abs().sum() > 0
+
+
+def learned(source, target, rotation, dtype, tolerance=None):
+    """The gradients of a smooth image's warp to the image, the cameras and the rotation."""
+    source, target = (camera.clone().to(dtype).requires_grad_() for camera in (source, target))
+    rotation = None if rotation is None else rotation.to(dtype).requires_grad_()
+    generator = torch.Generator().manual_seed(0)
+    image, weights = (torch.rand(1, 1, side, side, generator=generator, dtype=torch.float64) for side in (24, 40))
+    image = F.interpolate(image, source.image_size, mode="bicubic").to(dtype).requires_grad_()
+    warp = ct.Warp(source, target, rotation, mode="bicubic", tolerance=tolerance)
+    loss = (warp(image) * F.interpolate(weights, target.image_size, mode="bicubic").to(dtype)).sum()
+    leaves = [p for p in (image, *source.parameters(), *target.parameters(), rotation) if p is not None]
+    return torch.autograd.grad(loss, [leaf for leaf in leaves if leaf.requires_grad], allow_unused=True)
+
+
+def check_gradients(*warp):
+    true = [g for g in learned(*warp, torch.float64, 0.0) if g is not None]
+    for dtype, tolerance in ((torch.float32, None), (torch.float64, 1e-3)):
+        rounded, given = (
+            [(g.double() - t).norm() / t.norm() for g, t in zip(found, true, strict=True)]
+            for found in ([g for g in learned(*warp, dtype, at) if g is not None] for at in (0.0, tolerance))
+        )
+        for least, error in zip(rounded, given, strict=True):
+            assert error <= 2 * least + 5e-5
+
+
+@each_kind
+def test_warps_that_learn_have_the_gradients_of_exact_ones(key):
+    camera = next(iter(real(key).values())).float().requires_grad_(False).resize(240, 320)
+    straight = ct.Dewarp(camera).target
+    check_gradients(camera, straight, None)
+    check_gradients(straight, camera, turn(5.0, -10.0, 30.0))
+
+
+def test_a_mixed_batch_and_a_panorama_learn_as_exact_ones():
+    target = ct.Pinhole.from_fov(100, image_size=(120, 160))
+    lenses = [ct.KannalaBrandt.from_fov(120, image_size=(160, 320)), ct.Mei.from_fov(120, image_size=(160, 320))]
+    check_gradients(ct.Mixed(lenses), target, turn(40.0))
+    panorama = ct.Equirectangular([320 / 2 / math.pi] * 2 + [30.0, 79.5], image_size=(160, 320))
+    check_gradients(panorama, target, turn(160.0, 30.0))
+
+
+@pytest.mark.parametrize(("most", "some"), [(CELL_CUBIC, CELL_QUINTIC), (CELL_QUINTIC, CELL_CUBIC)])
+def test_pixels_of_a_lattice_and_their_transpose_are_those_of_torch(most, some):
+    generator = torch.Generator().manual_seed(0)
+    for size in ((16, 24), (77, 601)):
+        n, m = (-(-side // 8) for side in size)
+        nodes, cells = torch.randn(2, 2, n + 5, m + 5, generator=generator), torch.full((2, n, m), most).int()
+        cells[0, 0, 1], cells[0, 1, 0], cells[1, -1, -1], cells[:, -1, 0] = CELL_EMPTY, 0, 1, some
+        exact = torch.randn(2, 2, 8, 8, generator=generator)
+        exact[:, 0, :3] = torch.nan
+        cotangent, found = torch.randn(2, *size, 2, generator=generator), []
+        for dtype in (torch.float32, torch.float64):
+            leaves = nodes.to(dtype).requires_grad_(), exact.to(dtype).requires_grad_()
+            where = Lattice(leaves[0], cells, leaves[1], size).pixels
+            by_nodes, by_exact = torch.autograd.grad(where.grid, leaves, cotangent.to(dtype))
+            found.append((where.grid, where.mapped, by_nodes, by_exact[~exact.isnan()]))
+        for compiled, recorded in zip(*found, strict=True):
+            torch.testing.assert_close(compiled, recorded.to(compiled.dtype), rtol=1e-4, atol=1e-4)
+
+
+def test_second_derivatives_of_warps_that_learn_are_those_of_the_lattice():
+    numbers = [torch.tensor(n).double().requires_grad_() for n in ([40.0, 41, 39, 31], [0.02, -0.01, 0.003, -0.001])]
+    target = ct.Pinhole(torch.tensor([60.0, 60, 39.5, 31.5]), image_size=(64, 80)).requires_grad_(False)
+
+    def grid(*numbers):
+        source = ct.KannalaBrandt(*numbers, image_size=(64, 80))
+        return ct.Warp(source, target.to(numbers[0].dtype), tolerance=0.01).grid()[:, ::7, ::7].sin()
+
+    assert torch.autograd.gradcheck(grid, numbers, atol=1e-4, fast_mode=True)
+    assert torch.autograd.gradgradcheck(grid, numbers, atol=1e-4, fast_mode=True)
+    single = [n.detach().float().requires_grad_() for n in numbers]
+    for of, dtype in ((single, torch.float32), (numbers, torch.float64)):
+        first = torch.autograd.grad(grid(*of).sum(), of, create_graph=True)
+        second = torch.autograd.grad(sum(g.square().sum() for g in first), of)
+        if dtype == torch.float32:
+            rough = second
+    for r, s in zip(rough, second, strict=True):
+        assert (r - s).norm() <= 1e-3 * s.norm()
