@@ -186,6 +186,11 @@ class CameraHead(GeometryModule):
         none = numbers.new_zeros(len(numbers), len(limits.given))
         if not self._coefficients:
             return none
+        if torch.onnx.is_in_onnx_export():  # which has no cummax
+            raise RuntimeError(
+                f"{type(self).__name__}: model must be 'pinhole' in torch.onnx.export; got {self._model_name()}. "
+                "Export the network up to head.linear, and call head.camera(numbers) in Python; torch.export takes all"
+            )
         step = (self._discs[-1] - self._discs[0]).to(numbers) / (_NODES - 1)
         place = ((disc - self._discs[0].to(numbers)) / step.clamp(min=1e-12)).clamp(0, _NODES - 1)
         before = place.detach().nan_to_num().long().clamp(max=_NODES - 2)

@@ -242,3 +242,10 @@ def test_heads_of_no_features_and_on_the_meta_device(model):
     head = ct.CameraHead(8, model, image_size=SIZE)
     assert head(torch.randn(0, 8)).batch_shape == (0,)
     assert head.to("meta")(torch.randn(2, 8, device="meta")).batch_shape == (2,)
+
+
+def test_the_error_of_an_export_to_onnx_says_what_exports():
+    pytest.importorskip("onnxscript")
+    head = ct.CameraHead(4, "brown_conrady", image_size=(48, 64)).eval()
+    with pytest.raises(Exception, match=r"'pinhole' in torch.onnx.export; got BrownConrady. Export.*up to head.linear"):
+        torch.onnx.export(head, (torch.zeros(2, 4),), dynamo=True, verbose=False)
