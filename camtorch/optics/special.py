@@ -21,6 +21,7 @@ from camtorch.evaluate.tensors import may_look_at
 # a first derivative accurate to 1e-13 of the function's own scale.
 _SMALL_ANGLE2 = 1e-2
 _SMALL_SLOPE2 = 1e-3
+_MANY = 1000  # values of which the small ones are taken out
 
 
 def _series(t: Tensor, coefficients: list[float]) -> Tensor:
@@ -39,7 +40,7 @@ def _blend(
     in_far: tuple[float | None, ...],
 ) -> Tensor:
     """Return `near` of planes where they are small, else `far`; each sees numbers, or None: the plane, elsewhere."""
-    looks = small.ndim > 0 and may_look_at(small, *planes)
+    looks = may_look_at(small, *planes) and small.numel() > _MANY
     places = small.nonzero(as_tuple=True) if looks else ()
     if looks and not len(places[0]):
         return far(*planes)

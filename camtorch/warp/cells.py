@@ -23,7 +23,6 @@ _MARGIN, _OVERSHOOT = (
     0.5,
 )  # of half an image beyond which nothing is sampled; by which cubics may leave their nodes
 _FAR_OFF = 4  # pixels
-_FEW = 256  # cells in doubt that are computed sooner than looked at
 _PROBES = ((4, 0), (0, 4), (8, 4), (4, 8), (4, 4))  # across and down: the middles of a cell's sides, and its own
 _MIDDLE = {4: (0.0, -1 / 16, 9 / 16, 9 / 16, -1 / 16, 0.0), 6: tuple(w / 256 for w in (3, -25, 150, 150, -25, 3))}
 """Weights of six nodes in the middle of a cubic through four of them, and of a quintic."""
@@ -81,14 +80,11 @@ def settle(
     """Find out about cells in doubt: polynomials miss most in the middle of a cell and of its sides.
 
     Where half the tolerance is kept there, or an image that ends in zeros is far off, they become `CELL_CUBIC`; or
-    `CELL_QUINTIC`, for polynomials through six nodes; the others are `CELL_TODO`, and so are
-    all if they are few. The target's first row is `first`.
+    `CELL_QUINTIC`, for polynomials through six nodes; the others are `CELL_TODO`. The
+    target's first row is `first`.
     """
     doubt = cells == CELL_DOUBT
-    count = int(doubt.sum())
-    if count <= _FEW:
-        if count:
-            cells.masked_fill_(doubt, CELL_TODO)
+    if not bool(doubt.any()):
         return
     chosen, wanted = places(doubt)
     probes = nodes.new_tensor(_PROBES)
