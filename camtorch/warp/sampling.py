@@ -29,6 +29,7 @@ PADDINGS: tuple[PaddingMode, ...] = get_args(PaddingMode)
 SHRINKS = 1.5  # pixels of the image to one of the result, from which on edits antialias by themselves
 SURELY = 0.999  # of that: whatever rounding does, less does not
 _LARGE = 1 << 23  # numbers in an image whose copy in float32 leaves every cache
+_STRIP = 1 << 18  # numbers of a result in float32 that are made at a time
 _TILE = 512  # pixels along the sides of what is then sampled at a time
 _TRACED_LEVELS = 4  # where the values that decide cannot be looked at: down to a sixteenth
 
@@ -140,7 +141,17 @@ def _by_torch(images: Tensor, where: Sampling, how: Sampler, kept: dict[int, Pyr
     step = count if wide or not plain else 1 if large else thread_count()
     if not large and count <= step:
         levels = _levels(kept, 0, widen(images))
-        return narrow(_render(levels.images, where.grid, where, levels, how), dtype)
+        if wide or not plain:
+            return narrow(_render(levels.images, where.grid, where, levels, how), dtype)
+        # strip by strip, whose memory is used again: new memory takes as long as sampling
+        _, height, width, _ = where.grid.shape
+        result = images.new_empty(*images.shape[:2], height, width)
+        rows = max(_STRIP // max(math.prod(images.shape[:2]) * width, 1), 1)
+        for top in range(0, height, rows):
+            here = where.part(slice(top, top + rows))
+            made = _render(levels.images, here.grid, here, levels, how)
+            result[:, :, top : top + rows] = narrow(made, dtype)
+        return result
     result = images.new_empty(*images.shape[:2], *where.grid.shape[1:3])
     for i in range(0, count, step):
         part = slice(i, i + step)
