@@ -23,7 +23,7 @@ from camtorch.augment import numpy as arrays
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.fields import KINDS, kind_of
 from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
-from camtorch.augment.landmarks import Mirroring
+from camtorch.augment.landmarks import Mirroring, Table
 from camtorch.augment.matrices import NAMES
 from camtorch.augment.ranges import Range
 from camtorch.augment.sample import Calls, Sample, Unknown, detached
@@ -34,7 +34,7 @@ from camtorch.values.arguments import shown
 _OWNER = "albumentations.Transform"
 _OWN = "image", "images", "mask", "masks", "bboxes", "keypoints"  # targets of pipelines
 _CLASS = "__class__"  # the key of a saved value's class
-_KINDS: tuple[Any, ...] = tuple, dict, nn.ModuleList, Range, Mirroring, Kept  # of saved values
+_KINDS: tuple[Any, ...] = tuple, dict, nn.ModuleList, Range, Mirroring, Table, Kept  # of saved values
 _OF_MODULES = nn.Module().__dict__
 
 
