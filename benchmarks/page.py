@@ -161,7 +161,7 @@ def _sentence(runs: Sequence[Run]) -> str:
     lost = [ratio for ratio in every if ratio > 1]
     page = "[the page on performance](docs/performance.md#where-others-are-faster)"
     by = f"{times(median(lost))} in the median, {times(max(lost))} at the worst"
-    return f"Without one, other libraries are faster in {len(lost)} of {len(every)} rows of {page}: {by}."
+    return f"Without it, other libraries are faster in {len(lost)} of {len(every)} rows of {page}: {by}."
 
 
 def _gpu(runs: Sequence[Run]) -> str:
