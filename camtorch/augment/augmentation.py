@@ -157,7 +157,12 @@ class Augmentation(SampleTransform):
         return draw(self.ranges, count, p, same_on_batch, generator)
 
     def with_boxes(self, draw: Mapping[str, Any], boxes: Tensor | Sequence[Tensor] | None) -> Mapping[str, Any]:
-        """Return a draw with the boxes it needs of those of samples, (B, M, 4), or (M, 4) each, or None."""
+        """Return the draw, completed by the box that each sample's crop follows.
+
+        Args:
+            draw: A draw; boxes that it already holds are kept.
+            boxes: Boxes of the samples, (B, M, 4), or (M, 4) for each; None if samples have none.
+        """
         if not (missing := {name: index for name, index in self.crops.items() if name not in draw}):
             return draw
         if boxes is None:

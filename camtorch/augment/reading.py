@@ -121,7 +121,9 @@ def _check_size(field: str, shape: tuple[int, ...], name: str, size: tuple[int, 
 def form_of(
     sample: Mapping[str, Any], camera: object, fields: Mapping[str, str], revision: object
 ) -> tuple[Any, ...] | None:
-    """Return all that a plan depends on; None if a field is no tensor or number, or the camera a `Mixed`.
+    """Return all that a plan depends on; None if a plan cannot be kept.
+
+    A plan cannot be kept if the camera is a `Mixed`, tensors are traced, or a field is, for example, a list.
 
     revision: that of the transform, which changes with its options.
     """

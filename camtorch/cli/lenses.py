@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def find(words: str, size: tuple[int, int] | None = None) -> list[lenses.Lens]:
-    """Return the lenses of a name, best first, at least one."""
+    """Return the lenses of a name, best first; raise a ValueError if there is none."""
     try:
         lenses.find(words, image_size=size)
     except ValueError as error:

@@ -162,7 +162,10 @@ class Domain:
 
     @_per_camera
     def limits2(self) -> Tensor:
-        """Return (C, azimuths), the squared radius, up to the next one, before which the orientation decides, or 0."""
+        """Return squared radii (C, azimuths): from each azimuth to the next, the orientation decides only within them.
+
+        They are 0 for cameras whose inverse goes stage by stage.
+        """
         if self.all_stagewise:
             return self.k.new_zeros(self.k.shape[0], AZIMUTHS)
         limits2 = self._followed[0]

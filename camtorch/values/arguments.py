@@ -330,7 +330,7 @@ def check_radians(vectors: Tensor, name: str, owner: str) -> None:
 
 
 def check_angles(angles: Tensor, owner: str) -> None:
-    """Raise a ValueError if plain angles are more than a turn, as degrees are."""
+    """Raise a ValueError if angles exceed a turn, as degrees would; a network's predictions are not checked."""
     if not is_predicted(angles) and known_false(~(angles.abs() > 2 * math.pi * (1 + 1e-6))):
         raise ValueError(
             f"{owner}: angles must be radians; got {float(angles.abs().max()):.4g}, which seems to be degrees. "

@@ -189,7 +189,7 @@ class AffineWarp(MirrorWarp):
         return AffineWarp(self.target, self.source, inverted(self.map), rotation, **self.options)
 
     def pin(self) -> Warp:
-        """Return this warp: copies need no sampling positions, and other positions are kept when first computed."""
+        """Return this warp: pure copies need no sampling positions, others keep them from the first call."""
         return self
 
     def _depends(self, smooth: bool) -> bool:
