@@ -17,7 +17,6 @@ from camtorch.cameras.editing import edited
 from camtorch.cameras.mixed import Mixed
 from camtorch.rays.lattices import slopes_at_axis
 from camtorch.values.arguments import as_image_size, as_number, no_camera, shown
-from camtorch.values.module import typed_as
 from camtorch.warp.affine import AffineWarp
 
 
@@ -134,9 +133,7 @@ class CanonicalCamera(SampleTransform):
         return self._resize_sample(sample, batch, change.inverse())
 
     if TYPE_CHECKING:
-
-        @typed_as(forward)
-        def __call__(self, *args: Any, **options: Any) -> Any: ...
+        __call__ = forward
 
     def _scale_sample(self, sample: Sample, batch: Batch, scale: Tensor) -> Sample:
         """Return the sample with every length of the camera's frame multiplied by `scale` (B,)."""

@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Collection, Sequence
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +17,7 @@ from camtorch.networks.limits import Limits
 from camtorch.networks.prior import prior_of
 from camtorch.optics.radial_inverse import precise
 from camtorch.values.arguments import as_coordinates, as_flag, as_image_size, as_number, as_whole
-from camtorch.values.module import GeometryModule, typed_as
+from camtorch.values.module import GeometryModule
 
 _ASPECT = 0.1
 _LARGEST = 1e6  # a number whose square is finite, and whose gradient is negligible
@@ -143,9 +143,7 @@ class CameraHead(GeometryModule):
             return self.camera(self.linear(features.to(self.linear.weight.dtype)))
 
     if TYPE_CHECKING:
-
-        @typed_as(forward)
-        def __call__(self, *args: Any, **options: Any) -> Any: ...
+        __call__ = forward
 
     def camera(self, numbers: Tensor) -> Camera:
         """Return cameras (*B) for numbers (*B, n) in the order of `names`, for use with your own layer.

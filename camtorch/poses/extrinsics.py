@@ -25,7 +25,7 @@ from camtorch.values.arguments import (
     hinting,
     shown,
 )
-from camtorch.values.module import BatchedModule, remade, typed_as
+from camtorch.values.module import BatchedModule, remade
 
 
 class Extrinsics(BatchedModule):
@@ -92,9 +92,7 @@ class Extrinsics(BatchedModule):
         return restore(turned + translation.mT.unsqueeze(-1))
 
     if TYPE_CHECKING:
-
-        @typed_as(forward)
-        def __call__(self, *args: Any, **options: Any) -> Any: ...
+        __call__ = forward
 
     def matrix(self) -> Tensor:
         """Return the matrices (*B, 4, 4) [[R, t], [0, 1]]."""

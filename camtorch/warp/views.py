@@ -27,7 +27,7 @@ from camtorch.values.arguments import (
     shown,
 )
 from camtorch.values.dtypes import check_averaged, narrow, widen
-from camtorch.values.module import GeometryModule, remade, typed_as
+from camtorch.values.module import GeometryModule, remade
 from camtorch.warp.boxes import corners_of
 from camtorch.warp.crops import CropsWarp, flattened
 from camtorch.warp.sampling import Mode
@@ -85,9 +85,7 @@ class Views(GeometryModule):
         return np.stack(views, int(images.ndim == 4)) if isinstance(images, np.ndarray) else views
 
     if TYPE_CHECKING:
-
-        @typed_as(forward)
-        def __call__(self, *args: Any, **options: Any) -> Any: ...
+        __call__ = forward
 
     def valid_masks(self) -> Tensor:
         """Return (1, N, 1, S, S) bool: whether the camera sees each pixel of the views."""
