@@ -22,7 +22,6 @@ from camtorch.evaluate.door import (
     in_transform,
     is_constant,
     is_eager,
-    is_exporting,
     is_for_here,
     keeps_graph,
     outside_inference,
@@ -328,18 +327,6 @@ class CameraPair(GeometryModule):
                 grid = planes.movedim(1, -1)
                 return Sampling(grid, mapped, local_scale(grid, mapped, self.sampled) if self.antialias else None)
         return self.locate(range(self.target.size_for("Warp")[0]), padding, tolerance)
-
-    def pin_positions(self) -> None:
-        """Keep the positions from now on, with their graph, if they are to be kept at all."""
-        # the operator of compiled code keeps its own; what inference mode makes could not be used in a graph later
-        is_operator = self.is_called(self.target.intrinsics.detach())
-        if self.is_pinned or is_operator or torch.is_inference_mode_enabled():
-            return
-        if self.route() == "graph":
-            where = self.locate(range(self.target.size_for("Warp")[0]), self.padding_mode, 0.0)
-        else:
-            where = self.positions("kept") if is_exporting() else self.computed(self.padding_mode, self.tolerance)
-        self._kept.renew(lambda: Plan(where, self.padding_mode))
 
     def strip_positions(self, padding: PaddingMode = "zeros", count: int | None = None) -> Iterator[tuple[slice, Any]]:
         """Yield rows of the target, `count` at a time, and their positions on the source's image."""

@@ -130,7 +130,10 @@ class PlaneWarp(Warp):
         rotation, shift = (t.to(rays.dtype) for t in self._pose())
         if not back:
             rotation, shift = rotation.mT, -(rotation.mT @ shift[..., None])[..., 0]
-        near, meets = self._nearness(rays, of_source=not back)
+        normal, distance = (self.normal, self.distance) if back else self._plane_of_source()
+        normal = beside(normal / distance[..., None], rays)
+        near = (rays * normal).sum(-1)  # 1 / distance to the plane
+        meets = near.detach() > _GRAZING * torch.linalg.vector_norm(normal.detach(), dim=-1)
         directions = turn(rotation, rays, "rays") + beside(shift, rays) * near[..., None]
         seen, mapped = target.project(off_poles(target, directions))
         return placed(target, seen, mapped & has_ray & meets, on_image)
@@ -138,13 +141,6 @@ class PlaneWarp(Warp):
     def transform_rays(self, rays: Numbers) -> Tensor:
         rays = as_coordinates(rays, "rays", 3, type(self).__name__, self.source.intrinsics.device, "B, *N")
         return turn(self._pose()[0].mT.to(rays.dtype), rays, "rays")
-
-    def _nearness(self, rays: Tensor, of_source: bool) -> tuple[Tensor, Tensor]:
-        """Return 1 / distance to the plane along unit rays (B, *N, 3) of either camera, and whether they meet it."""
-        normal, distance = self._plane_of_source() if of_source else (self.normal, self.distance)
-        normal = beside(normal / distance[..., None], rays)
-        near = (rays * normal).sum(-1)
-        return near, near.detach() > _GRAZING * torch.linalg.vector_norm(normal.detach(), dim=-1)
 
     def inverse(self) -> PlaneWarp:
         """Return the warp from target to source, of the same plane. Pixels outside the image stay lost."""

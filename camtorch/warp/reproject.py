@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,12 +13,12 @@ from camtorch.evaluate.tensors import are_plain, known_true
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, turn
 from camtorch.rays.depth import as_depth, depth_scale
-from camtorch.values.arguments import Numbers, as_batch, check_devices, one_of, shown
+from camtorch.values.arguments import Numbers, as_batch, check_devices, shown
 from camtorch.values.dtypes import check_averaged
-from camtorch.values.module import GeometryModule, typed_as
+from camtorch.values.module import GeometryModule
 from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.panorama import off_poles, seam_of
-from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, PaddingMode, as_fill, render
+from camtorch.warp.sampling import Fill, Mode, PaddingMode, as_options, render
 from camtorch.warp.warp import as_sized
 
 _SNAP = {torch.float32: 4e-3, torch.float64: 1e-8}  # px, within which rounding may have moved a pixel
@@ -72,9 +72,8 @@ class Reproject(GeometryModule):
         self.source, self.target = as_sized(source, "source", owner), as_sized(target, "target", owner)
         self.batch_shape = check_pose(owner, extrinsics, "source from target", source=source, target=target)
         self.extrinsics = extrinsics
-        self.mode = one_of(mode, MODES, "mode", owner)
-        self.padding_mode = one_of(padding_mode, PADDINGS, "padding_mode", owner)
-        self.fill = as_fill(fill, owner)
+        options = as_options(owner, mode, padding_mode, fill)
+        self.mode, self.padding_mode, self.fill = options["mode"], options["padding_mode"], options["fill"]
         self._memo = Kept()
         seam_of(source)  # keep it while values can be read: traced code needs it too
 
@@ -123,9 +122,7 @@ class Reproject(GeometryModule):
         return result.unflatten(2, (steps, -1)), valid
 
     if TYPE_CHECKING:
-
-        @typed_as(forward)
-        def __call__(self, *args: Any, **options: Any) -> Any: ...
+        __call__ = forward
 
     def _seen(self, depth: Tensor, kind: str) -> tuple[Tensor, Tensor]:
         """Return source pixels (B, D, H', W', 2), and whether they are valid."""

@@ -207,10 +207,6 @@ class SampleCall:
             self._back.next = None  # one thread makes the lattice, and needs no counter of those made
         self._doubtful = [i for i, how in enumerate(form.hows) if how in ("boxes", "pose", "rotation vectors")]
         self._dtype, self._count = dtype, count
-        self.keeps_dtypes: bool = all(
-            isinstance(how, Sampler) or value.dtype == dtype for value, how in zip(form.values, form.hows, strict=True)
-        )
-        """Whether all results are of the dtypes of the values."""
         ways = zip(form.values, form.hows, strict=True)
         self._decides = form.decides and any(
             isinstance(how, Sampler) and how.mode != "nearest" and value.dtype != torch.bool for value, how in ways

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.door import is_exporting
 from camtorch.poses.rotations import as_rotation, turn
 from camtorch.values.arguments import (
     LEFT,
@@ -23,11 +24,10 @@ from camtorch.values.arguments import (
     one_of,
 )
 from camtorch.values.dtypes import check_averaged
-from camtorch.values.module import typed_as
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.grid import OUTSIDE
-from camtorch.warp.plan import CameraPair
+from camtorch.warp.plan import CameraPair, Plan
 from camtorch.warp.sampling import (
     MODES,
     PADDINGS,
@@ -182,9 +182,7 @@ class Warp(CameraPair):
         return self.warped(images.flatten(1, -3), sampler._replace(fill=each)).unflatten(1, images.shape[1:-2])
 
     if TYPE_CHECKING:
-
-        @typed_as(forward)
-        def __call__(self, *args: Any, **options: Any) -> Any: ...
+        __call__ = forward
 
     def strips(
         self,
@@ -249,7 +247,15 @@ class Warp(CameraPair):
 
     def pin(self) -> Warp:
         """Compute the grid once, with its graph, for a warp whose cameras will not change; return the warp."""
-        self.pin_positions()
+        # the operator of compiled code keeps its own; what inference mode makes could not be used in a graph later
+        is_operator = self.is_called(self.target.intrinsics.detach())
+        if self.is_pinned or is_operator or torch.is_inference_mode_enabled():
+            return self
+        if self.route() == "graph":
+            where = self.locate(range(self.target.size_for("Warp")[0]), self.padding_mode, 0.0)
+        else:
+            where = self.positions("kept") if is_exporting() else self.computed(self.padding_mode, self.tolerance)
+        self._kept.renew(lambda: Plan(where, self.padding_mode))
         return self
 
     def transform_points(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
