@@ -80,7 +80,6 @@ def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, thresh
     batch, count = seen.shape
     best = torch.eye(3, 4, dtype=points.dtype, device=points.device).repeat(batch, 1, 1)
     costs, agree = points.new_full((batch,), count * threshold**2), torch.zeros_like(counts)
-    search = _Search(lines, order, counts, best, costs, agree)
     compiled = library() if points.is_cpu else None
     generator = torch.Generator().manual_seed(0)
     drawn, (rows,) = 0, (counts >= LEAST).nonzero(as_tuple=True)
@@ -98,7 +97,7 @@ def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, thresh
             threads = min(thread_count(), len(rows), 1 + len(rows) * samples * count // _SHARED)
             spread(partial(compiled.camtorch_consensus, call), threads)
         else:
-            search.round(rows, numbers.to(points.device))
+            _run_round(lines, order, counts, (best, costs, agree), rows, numbers.to(points.device))
         drawn += samples
         share, few = agree[rows].clamp(min=_CONVINCING).to(costs), counts[rows].clamp(min=_CONVINCING).to(costs)
         share = torch.stack([(share - i) / (few - i) for i in range(size)]).prod(0)
@@ -107,40 +106,36 @@ def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, thresh
     return best[..., :3], best[..., 3]
 
 
-class _Search(NamedTuple):
-    """The inputs of rounds, and their results: the best poses (B, 3, 4), costs and numbers of near points (B,)."""
+def _run_round(
+    lines: _Lines, order: Tensor, counts: Tensor, found: tuple[Tensor, Tensor, Tensor], rows: Tensor, numbers: Tensor
+) -> None:
+    """Improve what was found for some rows, poses (B, 3, 4), costs and numbers of near points (B,), by a round.
 
-    lines: _Lines
-    order: Tensor  # (B, N), the indices of points, seen ones first
-    counts: Tensor  # (B,), the number of seen points
-    best: Tensor
-    costs: Tensor
-    agree: Tensor
-
-    def round(self, rows: Tensor, numbers: Tensor) -> None:
-        """Run a round for some rows, by random numbers (H, N)."""
-        samples, count = numbers.shape
-        for part in rows.split(max(1, _AT_ONCE // (12 * samples * count))):
-            lines = _Lines(self.lines.points[part], self.lines.measures[part], self.lines.threshold)
-            first = torch.arange(count, device=rows.device) < self.counts[part, None]
-            is_seen = torch.zeros_like(first).scatter(1, self.order[part], first)
-            four = torch.where(is_seen[:, None], numbers, -1.0).topk(4).indices
-            given = self.lines.points, self.lines.measures[:, 2]
-            points, rays = (t[part[:, None, None], four].flatten(0, 1) for t in given)
-            found = poses_from_rays(points, rays, torch.ones_like(rays[..., 0]))
-            poses = torch.cat((found.rotations, found.translations[..., None]), -1)
-            poses = torch.where(found.valid[..., None, None], poses, torch.nan)
-            # matrices (B, 12, 3 N) that map [R t] to the measures of all points
-            forms = lines.measures[..., :, None] * pad(lines.points, (0, 1), value=1.0)[:, None, :, None]
-            forms, poses = forms.flatten(3).flatten(1, 2).mT, poses.view(len(part), -1, 3, 4)
-            chosen = lines.squares(poses, forms).sum(-1).topk(_TRIED, largest=False).indices
-            poses = poses.take_along_dim(chosen[..., None, None], 1).nan_to_num(0.0, 0.0, 0.0)
-            poses = torch.cat((poses, self.best[part, None]), 1)
-            for _ in range(_STEPS):
-                poses = lines.fitted(poses, forms)
-            squares = lines.squares(poses, forms)
-            cost, index = squares.sum(-1).min(-1)
-            (better,) = (cost < self.costs[part]).nonzero(as_tuple=True)
-            index, part = index[better], part[better]
-            self.best[part], self.costs[part] = poses[better, index], cost[better]
-            self.agree[part] = (squares[better, index] < lines.threshold**2).sum(-1)
+    The order (B, N) of points has seen ones first, whose numbers are `counts`; samples are drawn by `numbers` (H, N).
+    """
+    best, costs, agree = found
+    samples, count = numbers.shape
+    for part in rows.split(max(1, _AT_ONCE // (12 * samples * count))):
+        these = _Lines(lines.points[part], lines.measures[part], lines.threshold)
+        first = torch.arange(count, device=rows.device) < counts[part, None]
+        is_seen = torch.zeros_like(first).scatter(1, order[part], first)
+        four = torch.where(is_seen[:, None], numbers, -1.0).topk(4).indices
+        given = lines.points, lines.measures[:, 2]
+        points, rays = (t[part[:, None, None], four].flatten(0, 1) for t in given)
+        made = poses_from_rays(points, rays, torch.ones_like(rays[..., 0]))
+        poses = torch.cat((made.rotations, made.translations[..., None]), -1)
+        poses = torch.where(made.valid[..., None, None], poses, torch.nan)
+        # matrices (B, 12, 3 N) that map [R t] to the measures of all points
+        forms = these.measures[..., :, None] * pad(these.points, (0, 1), value=1.0)[:, None, :, None]
+        forms, poses = forms.flatten(3).flatten(1, 2).mT, poses.view(len(part), -1, 3, 4)
+        chosen = these.squares(poses, forms).sum(-1).topk(_TRIED, largest=False).indices
+        poses = poses.take_along_dim(chosen[..., None, None], 1).nan_to_num(0.0, 0.0, 0.0)
+        poses = torch.cat((poses, best[part, None]), 1)
+        for _ in range(_STEPS):
+            poses = these.fitted(poses, forms)
+        squares = these.squares(poses, forms)
+        cost, index = squares.sum(-1).min(-1)
+        (better,) = (cost < costs[part]).nonzero(as_tuple=True)
+        index, part = index[better], part[better]
+        best[part], costs[part] = poses[better, index], cost[better]
+        agree[part] = (squares[better, index] < these.threshold**2).sum(-1)
