@@ -338,6 +338,15 @@ class CameraPair(GeometryModule):
                 where = self.locate(rows, self._reach(padding), self.tolerance)
             yield slice(rows.start, rows.stop), where
 
+    def in_strips(self, images: Tensor, count: int | None, sampler: Sampler) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Yield rows of the target, images of them, and the mask of `on_image`."""
+        kept: dict[int, Pyramid] = {}
+        images = self.lengthened(images)
+        for rows, where in self.strip_positions(sampler.padding_mode, count):
+            with torch.no_grad():
+                part, valid = render(images, where, *sampler, kept), self.on_image(where)
+            yield rows, part, valid
+
     def on_image(self, where: Sampling | Lattice) -> Tensor:
         """Whether the source maps pixels onto its image, (B or 1, 1, h, W')."""
         grid, source = where.pixels.grid.detach(), self.sampled

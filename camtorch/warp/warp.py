@@ -28,19 +28,7 @@ from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.grid import OUTSIDE
 from camtorch.warp.plan import CameraPair, Plan
-from camtorch.warp.sampling import (
-    MODES,
-    PADDINGS,
-    Fill,
-    Mode,
-    Options,
-    PaddingMode,
-    Pyramid,
-    Sampler,
-    as_fill,
-    as_options,
-    render,
-)
+from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, Options, PaddingMode, Sampler, as_fill, as_options
 
 
 def as_sized(camera: Camera, name: str, owner: str) -> Camera:
@@ -220,15 +208,7 @@ class Warp(CameraPair):
         rows = None if rows is None else as_whole(rows, "rows", "Warp", least=1)
         if isinstance(images, Tensor) and images.ndim != 4:
             raise ValueError(f"Warp: images must be (B, C, H, W) for strips; got shape {tuple(images.shape)}")
-        return self._in_strips(images, rows, checked(self, images, mode, padding_mode, fill))
-
-    def _in_strips(self, images: Tensor, count: int | None, sampler: Sampler) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        kept: dict[int, Pyramid] = {}
-        images = self.lengthened(images)
-        for rows, where in self.strip_positions(sampler.padding_mode, count):
-            with torch.no_grad():
-                part, valid = render(images, where, *sampler, kept), self.on_image(where)
-            yield rows, part, valid
+        return self.in_strips(images, rows, checked(self, images, mode, padding_mode, fill))
 
     def grid(self) -> Tensor:
         """Return positions (B or 1, H', W', 2) for `grid_sample(..., align_corners=False)`; -9 for none."""
