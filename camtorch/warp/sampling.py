@@ -13,7 +13,7 @@ from torch import Tensor
 
 from camtorch.evaluate.door import converted, in_transform, is_eager, may_look
 from camtorch.evaluate.tensors import are_known, are_plain
-from camtorch.native import sampler
+from camtorch.native import memory, sampler
 from camtorch.native.library import native_available, warn_if_missing
 from camtorch.values.arguments import as_flag, as_number, one_of, shown
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, wide_dtype, widen
@@ -140,12 +140,13 @@ def _by_torch(images: Tensor, where: Sampling, how: Sampler, kept: dict[int, Pyr
     # the same for all strips of an image, however many cores are free: the pyramids that they keep are of these parts
     step = count if wide or not plain else 1 if large else thread_count()
     if not large and count <= step:
-        levels = _levels(kept, 0, widen(images))
         if wide or not plain:
+            levels = _levels(kept, 0, widen(images))
             return narrow(_render(levels.images, where.grid, where, levels, how), dtype)
         # strip by strip, whose memory is used again: new memory takes as long as sampling
         _, height, width, _ = where.grid.shape
-        result = images.new_empty(*images.shape[:2], height, width)
+        copy = memory.empty(tuple(images.shape), wide_dtype(dtype), sampler.layout(images))
+        levels, result = _levels(kept, 0, copy.copy_(images)), sampler.maker(images, count, (height, width))()
         rows = max(_STRIP // max(math.prod(images.shape[:2]) * width, 1), 1)
         for top in range(0, height, rows):
             here = where.part(slice(top, top + rows))
