@@ -29,7 +29,7 @@ PADDINGS: tuple[PaddingMode, ...] = get_args(PaddingMode)
 SHRINKS = 1.5  # pixels of the image to one of the result, from which on edits antialias by themselves
 SURELY = 0.999  # of that: whatever rounding does, less does not
 _LARGE = 1 << 23  # numbers in an image whose copy in float32 leaves every cache
-_STRIP = 1 << 18  # numbers of a result in float32 that are made at a time
+_STRIP = 1 << 17  # numbers of a result in float32 that are made at a time
 _TILE = 512  # pixels along the sides of what is then sampled at a time
 _TRACED_LEVELS = 4  # where the values that decide cannot be looked at: down to a sixteenth
 
