@@ -147,8 +147,11 @@ def _pixel_by_pixel(
 ) -> tuple[Tensor, Tensor]:
     """Return positions (B, h, w, 2) of a lattice's pixels, and whether there are any, bool (B, h, w); by torch."""
     (height, width), (_, n, m) = size, cells.shape
-    planes, quintic = interpolated(nodes[:, :, 1:-1, 1:-1], n, m), cells == CELL_QUINTIC  # (B, 2, 8 n, 8 m)
-    if may_look(quintic) and bool(quintic.any()):
+    quintic = cells == CELL_QUINTIC
+    some_are = may_look(quintic) and bool(quintic.any())
+    all_are = some_are and bool(quintic.all())
+    planes = interpolated(nodes if all_are else nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
+    if some_are and not all_are:
         wide = quintic.repeat_interleave(STEP, 1).repeat_interleave(STEP, 2).unsqueeze(1)
         planes = torch.where(wide, interpolated(nodes, n, m), planes)
     blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))
