@@ -39,7 +39,7 @@ class FlipOptions(SampleOptions, total=False):
 
 
 class EditOptions(FlipOptions, total=False):
-    """Options of edits and of what keeps its field of view; see `Augmentation`."""
+    """Options of edits and of `RandomShutter`; see `Augmentation`."""
 
     p: float
 

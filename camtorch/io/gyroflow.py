@@ -19,7 +19,7 @@ def matches(keys: dict[str, Any]) -> bool:
 
 
 def parse(record: Record) -> Rig:
-    """Return the camera of the calibrated images, with the measured centre, if `asymmetrical` is set or not."""
+    """Return the camera of the calibrated images, with the measured centre, whether or not `asymmetrical` is set."""
     for key in (*_STRETCHES, "crop", "digital_lens"):
         if key in record and record[key].value not in (1.0, None):
             record[key].fail(f"must be 1.0 or null, because no model has it; got {record[key].value!r:.60}")

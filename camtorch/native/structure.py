@@ -24,7 +24,7 @@ class Struct(Structure):
     _kept: list[object]
 
     def keep(self, values: Tensor | Array[Any]) -> int:
-        """Return the address of values that live as long as this structure, which its copies do not keep."""
+        """Return the address of values and keep them alive with this structure; its copies do not keep them alive."""
         self.hold(values)
         return addressof(values) if isinstance(values, Array) else values.data_ptr()
 

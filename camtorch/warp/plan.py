@@ -193,7 +193,7 @@ class CameraPair(GeometryModule):
 
     @property
     def seam(self) -> Seam | None:
-        """By how much the source's images become longer before they are sampled."""
+        """The `Seam` that lengthens the source's images before they are sampled; None if they stay."""
         return seam_of(self._ends[0])
 
     @property
