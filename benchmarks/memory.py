@@ -1,6 +1,6 @@
 """Memory of a call by the allocator's account: every allocation of torch is an event of `torch.profiler`.
 
-It sees temporaries, what a custom backward keeps anywhere, and compiled code; not OpenCV and native code.
+It sees temporaries, what a custom backward keeps anywhere, and compiled graphs; not OpenCV and native code.
 """
 
 from collections.abc import Callable

@@ -31,7 +31,7 @@ This page shows how far results of camtorch are from those of other programs, an
 and back. `python docs/make_accuracy.py` makes it. A test compares it with what the script makes now.
 
 A cell is an upper bound of the largest error of all points, rounded up to a power of ten. Each error is measured
-twice, with the compiled code and with the formula that torch records, and the larger one counts. Results are in
+twice, with the native code and with the formula that torch records, and the larger one counts. Results are in
 float64, except in the column "float32".
 
 ## Against other programs
@@ -66,7 +66,7 @@ calibrations above, and one camera a model with all coefficients away from zero.
 
 * **Pixels**: a lattice of pixels on the image, to rays and back, in pixels.
 * **Rays**: rays on 24 azimuths from the axis to the rim of the image, to pixels and back, in radians.
-* **Jacobians**: derivatives of compiled code, compared with those of the recorded formula, relative to their column.
+* **Jacobians**: derivatives of native code, compared with those of the recorded formula, relative to their column.
 
 | model | cameras | widest ray | pixels | rays | Jacobians |
 |---|---:|---:|---:|---:|---:|
@@ -134,7 +134,7 @@ def _degrees(rays: Tensor) -> float:
 
 
 def _both(call: Callable[[Tensor], tuple[Tensor, Tensor]], rows: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield what compiled code returns for rows, and what the recorded formula does."""
+    """Yield what native code returns for rows, and what the recorded formula does."""
     yield call(rows)
     yield vmap(call)(rows)
 
@@ -182,7 +182,7 @@ def _relative(found: Tensor, reference: Tensor, camera: ct.Camera) -> float:
 
 
 def _jacobians(camera: ct.Camera, points: Tensor, parameters: Tensor, general: bool = False) -> Iterator[tuple]:
-    """Yield d(pixel)/d(point) (N, 2, 3) and d(pixel)/d(parameters) (N, 2, P): compiled, then recorded."""
+    """Yield d(pixel)/d(point) (N, 2, 3) and d(pixel)/d(parameters) (N, 2, P): native, then recorded."""
 
     def project(points: Tensor, parameters: Tensor) -> Tensor:
         intrinsics, distortion = parameters[..., :4], parameters[..., 4:]

@@ -42,7 +42,7 @@ def as_is(camera: Camera, rows: Tensor) -> Tensor:
 
 @dataclass(slots=True)
 class LazyWarp:
-    """A warp to cameras of which compiled code wrote the numbers; both become modules when somebody asks for them."""
+    """A warp to cameras of which native code wrote the numbers; both become modules when somebody asks for them."""
 
     base: Camera  # of whose model the new cameras are
     intrinsics: Tensor  # (4,) of one, or (B, 4)
@@ -50,7 +50,7 @@ class LazyWarp:
     image_size: tuple[int, int]
     rotation: Tensor | None  # (3, 3) or (B, 3, 3), or None
     options: Options  # of the warp
-    start: Native | None  # the cameras before, for compiled code
+    start: Native | None  # the cameras before, for native code
     native: Native | None  # the new ones; None where they have to be found
     factor: Sequence[float]  # (B,), on the focal lengths, that `min_filled` asks for
     found: Sequence[float]  # (B,): the share of each image that is filled
@@ -115,7 +115,7 @@ class Part:
         return self.moves.image_size if isinstance(self.moves, LazyWarp) else self.target.size_for("Warp")
 
     def between(self) -> tuple[Native, Native, Tensor | None] | None:
-        """Return both cameras and the rotation for compiled code; None if it takes more than that."""
+        """Return both cameras and the rotation for native code; None if there is more, such as light."""
         if isinstance(self.moves, LazyWarp):
             start, end = self.moves.start, self.moves.native
             return None if start is None or end is None else (start, end, self.moves.rotation)
@@ -190,7 +190,7 @@ class Part:
 
 
 def _single(camera: Camera) -> Native | None:
-    """Return a single camera for compiled code; None if it cannot evaluate it."""
+    """Return a single camera for native code; None if it cannot evaluate it."""
     if seam_of(camera) is not None or not are_numbers(*camera.tensors):
         return None
     rows = rows_of(camera, *camera.tensors)

@@ -58,7 +58,7 @@ class Edit(Augmentation):
 
         Returns:
             (*B, 2, 3) or (2, 3) in float64, from pixels (u, v, 1) to those of the new image, along its axes, or rows of
-            plain numbers, which compiled code can read; and (height, width).
+            plain numbers, which torch.compile can read; and (height, width).
         """
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:

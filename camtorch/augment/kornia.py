@@ -103,7 +103,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
             keepdim=keepdim,
         )
         self.augmentation, self.camera, options = augmentation, camera, augmentation.options
-        kind_of_camera(self.camera_for((1, 1)))  # which compiled code looks up
+        kind_of_camera(self.camera_for((1, 1)))  # which torch.compile looks up
         self.flags: dict[str, Any] = {"resample": Resample.get(options["mode"]), "align_corners": False}
         self.flags["padding_mode"] = SamplePadding.get(options["padding_mode"])
         if isinstance(camera, Camera):

@@ -1,4 +1,4 @@
-"""New cameras of drawn numbers, by compiled code; `cameras.py` has the same formulas, recorded by torch."""
+"""New cameras of drawn numbers, by native code; `cameras.py` has the same formulas, recorded by torch."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def _array(kind: type[c_double | c_float], count: int) -> Any:
 
 
 class Start:
-    """Cameras that others are drawn from, as compiled code takes them; kept for as long as their numbers stay."""
+    """Cameras that others are drawn from, as native code takes them; kept for as long as their numbers stay."""
 
     @classmethod
     def of(cls, source: Camera, base: Camera, *numbers: Any) -> Start | None:
-        """Return a `Start`; None if compiled code lacks a model, dtypes differ, or some numbers are no camera's.
+        """Return a `Start`; None if native code lacks a model, dtypes differ, or some numbers are no camera's.
 
         source: the camera before. base: whose lens the new ones have, single or (B,). numbers: see `__init__`.
         """
@@ -203,7 +203,7 @@ class Start:
             self._call.ends = call.ends = self._keep(ends, *ends.shape[-2:])
 
     def _tries(self, values: Mapping[str, Any], rows: int, call: structs.Draws) -> Native:
-        """Make the lenses that compiled code chooses among, of a model whose domain it does not make by itself."""
+        """Make the lenses that native code chooses among, of a model whose domain it does not make by itself."""
         amounts = torch.from_numpy(np.asarray(values["distortion"]).reshape(-1, structs.AMOUNTS))
         steps = (amounts.repeat(1, -(-call.count // structs.AMOUNTS))[:, : call.count] * self._sensitivity)[:, None]
         given = self._distortion.double().reshape(-1, 1, call.count)

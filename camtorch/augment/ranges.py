@@ -88,7 +88,7 @@ def draw(
     """Return `apply` (count,), true with probability p, and a value (count,) or (count, size) of every range.
 
     Lists of one sample and arrays of several take less time than tensors, which come where the generator is on another
-    device, or code is compiled.
+    device, or the call is traced.
     """
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")

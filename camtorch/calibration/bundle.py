@@ -247,7 +247,7 @@ class Bundle:
             at, own = torch.tensor(of, dtype=torch.long, device=p.device).view(-1, 2).unbind(-1)
             self.learnt.append((at, own))
         self.is_bent = free.bend or bool((state.bend != 0).any())
-        # compiled code knows one camera that sees flat boards at unknown poses
+        # native code knows one camera that sees flat boards at unknown poses
         plain = len(observed) == 1 and free.boards == "poses" and not (free.mounts[0] or self.is_bent)
         self.is_plain = plain and compiled_of(self.cameras, self.observed[0].pixels) is not None
         self.width = 6 if free.boards == "poses" else 3  # of the unknowns of a view

@@ -1,4 +1,4 @@
-"""Calls of compiled code for poses and views, in threads; `rays.py` and `pnp.py` have the same formulas."""
+"""Calls of native code for poses and views, in threads; `rays.py` and `pnp.py` have the same formulas."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Solved(NamedTuple):
 
 
 def can_search(*tensors: Tensor) -> bool:
-    """Whether compiled code can search for poses of these tensors."""
+    """Whether native code can search for poses of these tensors."""
     return library() is not None and all(t.is_cpu for t in tensors)
 
 
@@ -98,7 +98,7 @@ class Errors(NamedTuple):
     valid: Tensor  # (B, V, N)
     weights: Tensor  # (B, V, N), of the squares
     cost: Tensor  # (B, V)
-    triangles: tuple[Tensor, Tensor] | None = None  # of `Equations`, without priors, if compiled code made them
+    triangles: tuple[Tensor, Tensor] | None = None  # of `Equations`, without priors, if native code made them
 
 
 def project_views(

@@ -20,7 +20,7 @@ LEAST = 4  # points that determine a pose
 _CONVINCING = 6  # points: fewer may agree by chance
 _FIRST, _NEXT = 512, 1024  # samples in the first round and in each further one
 _SURE = 10.0  # the expected number of samples without an outlier at which the search ends
-# the most samples, for points of which hardly any agree: of three points, and of four without compiled code
+# the most samples, for points of which hardly any agree: of three points, and of four without native code
 _MOST, _MOST_OF_FOUR = 1 << 17, 1 << 14
 _TRIED, _STEPS = 8, 3  # the best poses of a round, and the fits of each to the points near it
 _AT_ONCE = 1 << 19  # numbers of a tensor, at most

@@ -1,4 +1,4 @@
-"""Functions of cameras that compiled code calls as one operator, without tracing them."""
+"""Functions of cameras that compiled graphs call as one operator, without tracing them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _FUNCTIONS = Registry()  # each function with its `shapes`
 def opaque(shapes: Function) -> Callable[[Function], Function]:
     """Return a decorator for functions of cameras with an image_size, tensors, None, floats, strings and pairs of ints.
 
-    In compiled code cameras arrive without their graphs, and no result may share memory with an argument. `shapes`
+    Compiled graphs pass cameras without their derivatives, and no result may share memory with an argument. `shapes`
     makes empty tensors like the results, from the same arguments with `CameraNumbers` for cameras.
     """
 

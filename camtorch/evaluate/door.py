@@ -1,4 +1,4 @@
-"""The way of a call: by compiled code on a CPU if nothing is recorded, else by the formula, which torch records."""
+"""The way of a call: native code on a CPU if nothing traces or transforms the call, else the formula in torch."""
 
 from __future__ import annotations
 
@@ -198,8 +198,8 @@ def may_look(tensor: Tensor) -> bool:
 class Way(NamedTuple):
     """The way in which a call is evaluated."""
 
-    is_native: bool  # compiled code evaluates the call, if it has the model
-    learns: bool  # derivatives of compiled code are recorded
+    is_native: bool  # native code evaluates the call, if it has the model
+    learns: bool  # autograd records the native call, with its derivatives
     is_known: bool  # the values of the parameters may be read, so that results made of them are kept
     order: int  # of the derivatives that the recorded formula must have exactly
     is_constant: bool = False  # the module is a constant of the exported program
@@ -236,7 +236,7 @@ def way_of(module: nn.Module, values: Tensor, *parameters: Tensor) -> Way:
 
 
 def is_native(values: Tensor) -> bool:
-    """Whether compiled code may read values, in a call without tracing or transforms."""
+    """Whether native code may read values, in a call without tracing or transforms."""
     return in_memory(values) and not is_recorded()
 
 

@@ -39,7 +39,7 @@ _transposed.register_autograd(lambda ctx, g: (_transposed(g, not ctx.to_planes),
 
 
 def to_planes(rows: Tensor) -> tuple[Tensor, ...]:
-    """Return rows (C, N, size) as planes (C, N). Compiled code for CPUs reads interleaved planes one by one."""
+    """Return rows (C, N, size) as planes (C, N). Compiled graphs on CPUs read interleaved planes one by one."""
     interleaved = is_for_here() and rows.device.type == "cpu" and rows.stride(-2) != 1
     interleaved = interleaved and not in_transform()  # the operator has no forward mode
     return (_transposed(rows, True) if interleaved else rows.movedim(-1, 0)).unbind(0)
@@ -56,7 +56,7 @@ def _(mask: Tensor) -> Tensor:
 
 
 def positive(mask: Tensor) -> Tensor:
-    """Return the mask as bool. Compiled code for CPUs writes bools one by one: ten times slower than this detour."""
+    """Return the mask as bool. Compiled graphs on CPUs write bools one by one: ten times slower than this detour."""
     compiled = is_for_here() and mask.device.type == "cpu"
     return _positive(mask.detach()) if compiled else mask > 0
 
@@ -71,7 +71,7 @@ def as_kept(plane: Tensor) -> Tensor:
 
 def power_of_two(size: Tensor) -> Tensor:
     """Return the largest power of two that is not above `size`: dividing by it costs no bit."""
-    if torch.compiler.is_compiling():  # compiled code does not vectorise the reading of bits
+    if torch.compiler.is_compiling():  # inductor does not vectorise the reading of bits
         return size
     if in_transform():  # torch.vmap cannot read bits before torch 2.11
         return size / torch.frexp(size).mantissa / 2
@@ -87,7 +87,7 @@ def order_of(order: int, *inputs: Tensor) -> int:
 
 
 def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:
-    """Return `function(*inputs)`; in compiled code only the inputs are kept, and backward computes it again."""
+    """Return `function(*inputs)`; in compiled graphs only the inputs are kept, and backward computes it again."""
     if torch.compiler.is_compiling() and torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         return cast("Result", checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False))
     return function(*inputs)

@@ -25,7 +25,7 @@ class Equations(NamedTuple):
 
 
 _NOTHING = 1e-20  # of a column's squares: the rounding left of a column that is a sum of others
-_FEW = 64  # shared unknowns, up to which compiled code is faster than LAPACK
+_FEW = 64  # shared unknowns, up to which native code is faster than LAPACK
 _FIRM = 1e-4  # of the largest singular value: smaller ones belong to unknowns that the data hardly determine
 
 

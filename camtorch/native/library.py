@@ -1,4 +1,4 @@
-"""The compiled sampler: which library is loaded, or why none is."""
+"""The native library: which one is loaded, or why none is."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def state() -> str:
 
 @functools.cache
 def native_available() -> bool:
-    """Whether images are sampled by compiled code; else torch samples them, slower and to the same results.
+    """Whether images are sampled by native code; else torch samples them, slower and to the same results.
 
     It is False if the environment has `CAMTORCH_NATIVE=0`, or if camtorch was installed without a C compiler:
     `camtorch --version` shows the reason.

@@ -1,4 +1,4 @@
-"""Calls of the compiled sampler: tensors to the pointers and sizes that it takes, and its tiles to threads."""
+"""Calls of the native sampler: tensors to the pointers and sizes that it takes, and its tiles to threads."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ Mode = Literal["nearest", "bilinear", "bicubic"]
 class ModeOfSampling(NamedTuple):
     """A row of `MODES`."""
 
-    code: int  # of the compiled sampler; -1 if torch alone has the mode
+    code: int  # of the native sampler; -1 if torch alone has the mode
     code_of_torch: int  # of its `grid_sampler_2d_backward`
     reach: int  # pixels to either side of a position that have a part in a sample
-    reads_interleaved: bool = False  # whether compiled code reads 3 or 4 channels side by side as vectors
+    reads_interleaved: bool = False  # whether native code reads 3 or 4 channels side by side as vectors
 
 
 MODES: dict[Mode, ModeOfSampling] = {

@@ -34,7 +34,7 @@ class Inverted(Chart):
 
     @property
     def _inverse(self) -> RadialInverse:
-        """The inverse with its tables, without a graph, made at first use; compiled code may keep nothing."""
+        """The inverse with its tables, without a graph, made at first use; compiled graphs may keep nothing."""
         if torch.compiler.is_compiling() and not is_portable_export():
             return RadialInverse(self.factor, self.parameters, FURTHEST)
         if self._known is None:

@@ -59,8 +59,8 @@ def evaluate_rows(
 ) -> tuple[Tensor, Tensor]:
     """Return planes (size, C, N), and valid (C, N), for rows (C, N, size) seen by cameras of this model.
 
-    This is the only place that decides whether a call is compiled or recorded. `lead` are the batch dims that C counts.
-    `cameras_of` returns what is kept of the tensors, if they are not this camera's.
+    It decides whether native code or torch evaluates a direction; `compiled_of` decides for warps, poses and boards.
+    `lead` are the batch dims that C counts. `cameras_of` returns results kept of other tensors than this camera's.
     """
     intrinsics, distortion = per_row(tensors[0], lead, rows), per_row(tensors[1], lead, rows)
     inputs = rows, intrinsics, distortion
@@ -95,7 +95,7 @@ def evaluate_rows(
 
 
 def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Native], bool] | None:
-    """Return the compiled geometry of cameras, each (B,) or single, and whether any of them is a batch.
+    """Return the native geometry of cameras, each (B,) or single, and whether any of them is a batch.
 
     None if `evaluate_rows` would record values of the first one's dtype, for several models, and with a shutter.
     """
@@ -126,7 +126,7 @@ def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Na
 
 
 class _Native(Function):
-    """The compiled geometry, with derivatives; second derivatives come from the formula."""
+    """The native geometry, with derivatives; second derivatives come from the formula."""
 
     @staticmethod
     def forward(

@@ -1,4 +1,4 @@
-"""Calls of the compiled geometry: rows to pointers and strides, and tiles to threads."""
+"""Calls of the native geometry: rows to pointers and strides, and tiles to threads."""
 
 from __future__ import annotations
 
@@ -296,7 +296,7 @@ def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
 
 
 def _call(native: Native, cameras: int, count: int, call: structs.Rows, tile: int = _TILE) -> int:
-    """Call the compiled geometry with rows, their results and what belongs to them."""
+    """Call the native geometry with rows, their results and what belongs to them."""
     if cameras != native.cameras:  # C would read elsewhere
         raise ValueError(f"rows must be of {native.cameras} cameras; got those of {cameras}")
     call.cameras, call.count, call.tile = native.pointer, count, tile

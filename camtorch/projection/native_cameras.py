@@ -1,4 +1,4 @@
-"""Cameras of one model in the form of the compiled geometry: codes of their parts, numbers, and tables."""
+"""Cameras of one model in the form of the native geometry: codes of their parts, numbers, and tables."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ _plans = Kept(64)  # keyed by optics and number of coefficients
 
 
 class Lenses:
-    """The lenses of cameras (C,) in the form of the compiled geometry: numbers, and their domains as far as known."""
+    """The lenses of cameras (C,) in the form of the native geometry: numbers, and their domains as far as known."""
 
     struct: structs.Cameras
     """The lenses' part of the struct; pointers that are not set are of values that are not known yet."""
@@ -111,7 +111,7 @@ class Lenses:
 
     @classmethod
     def known(cls, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], made: Native) -> Lenses:
-        """Return the lenses of cameras that compiled code made, with their parameters and domains."""
+        """Return the lenses of cameras that native code made, with their parameters and domains."""
         lenses = cls.__new__(cls)
         lenses.plan, lenses.optics_of, lenses.k = plan, optics_of, k
         lenses.slow_domain, lenses.cameras, lenses.dtype = domain, len(k), k.dtype
@@ -243,7 +243,7 @@ def lenses_of(plan: Plan, k: Tensor, make: Callable[[], Lenses]) -> Lenses:
 
 
 class Native:
-    """Cameras (C,) of one model in the form of the compiled geometry."""
+    """Cameras (C,) of one model in the form of the native geometry."""
 
     make_lenses: Callable[[Native], Lenses]
 
@@ -256,7 +256,7 @@ class Native:
 
     @classmethod
     def made(cls, base: Native, struct: structs.Cameras, room: object, lenses: Callable[[Native], Lenses]) -> Native:
-        """Return cameras that compiled code made, in `room`, like others; `lenses` makes their lenses at first use."""
+        """Return cameras that native code made, in `room`, like others; `lenses` makes their lenses at first use."""
         native = cls.__new__(cls)
         native.plan, native.dtype, native.parameters = base.plan, base.dtype, base.parameters
         native.struct, native.cameras, native.pointer = struct, struct.cameras, addressof(struct)
@@ -282,10 +282,10 @@ class Native:
 def native_of(
     optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None, domain: Callable[[], Domain], tables: bool
 ) -> Native | None:
-    """Return cameras of intrinsics (C, 4) and coefficients (C, n) in the form of the compiled geometry.
+    """Return cameras of intrinsics (C, 4) and coefficients (C, n) in the form of the native geometry.
 
     None without a library, on another device, and if a part of the optics has no code: a user's own. usable: (C, 1),
-    None if all are. domain: for parts that are not compiled. tables: whether the inverse is sure to come.
+    None if all are. domain: for parts that native code lacks. tables: whether the inverse is sure to come.
     """
     if library() is None or not intrinsics.is_cpu or not k.shape[0]:
         return None

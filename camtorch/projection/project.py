@@ -1,4 +1,4 @@
-"""Rays to pixels: the formula and the reasons why a point is invalid, as recorded in graphs, and compiled."""
+"""Rays to pixels: the formula and the reasons why a point is invalid, as torch records it, and in native code."""
 
 from __future__ import annotations
 

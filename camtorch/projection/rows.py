@@ -68,12 +68,12 @@ class CameraRows:
 
     @cached_property
     def native(self) -> Native | None:
-        """The cameras in the form of the compiled geometry; None if it does not have this model, or is not there."""
+        """The cameras in the form of the native geometry; None if that lacks this model, or there is no library."""
         domain = partial(domain_for, self.model, self.k, self._learns)
         return native_of(self.model.optics, self.intrinsics, self.k, self.usable, domain, tables=False)
 
     def cotangents(self, sums: Tensor | None, wanted: Sequence[bool]) -> tuple[Tensor | None, Tensor | None]:
-        """Return the cotangents of intrinsics and distortion, if wanted, for sums of `compiled.project_vjp`."""
+        """Return the cotangents of intrinsics and distortion, if wanted, for sums of `native_calls.project_vjp`."""
         if sums is None:
             return None, None
         of_intrinsics, sums = sums[:, :4] if wanted[0] else None, sums[:, 4:]
@@ -93,7 +93,7 @@ class CameraRows:
 
 
 def single_native(model: type[CameraLike], intrinsics: Tensor, k: Tensor) -> Native | None:
-    """Return a camera of usable numbers (4,) and (n,) for the compiled geometry; None if that lacks the model."""
+    """Return a camera of usable numbers (4,) and (n,) for the native geometry; None if that lacks the model."""
     k = k.detach()[None]
     return native_of(model.optics, intrinsics[None], k, None, partial(domain_for, model, k, False), tables=True)
 
@@ -146,7 +146,7 @@ def _ideal(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> t
 
 
 class Direction(NamedTuple):
-    """One direction of cameras (C,) of a model, for rows (C, N, size): as torch records it, and in compiled code."""
+    """One direction of cameras (C,) of a model, for rows (C, N, size): as torch records it, and in native code."""
 
     formula: Callable[..., tuple[Tensor, Tensor]]
     """The formula: model, rows, intrinsics (C, 4), distortion (C, n), cameras, order to planes (size, C, N), valid.
@@ -154,11 +154,11 @@ class Direction(NamedTuple):
     `cameras` are those of the parameters, if values may be read; derivatives up to `order` must be exact.
     """
     native: Callable[[Native, Tensor], tuple[Any, ...]]
-    """The compiled call, from cameras and rows to planes, valid, and perhaps more."""
+    """The native call, from cameras and rows to planes, valid, and perhaps more."""
     native_keeping: Callable[[Native, Tensor], tuple[Tensor, Tensor, tuple[Tensor, ...]]]
-    """The compiled call that also returns the tensors that `native_vjp` needs."""
+    """The native call that also returns the tensors that `native_vjp` needs."""
     native_vjp: Callable[..., tuple[Tensor | None, Tensor | None]]
-    """The compiled cotangents of rows and of the numbers of the cameras."""
+    """The native cotangents of rows and of the numbers of the cameras."""
     name: str  # of the rows in messages
     size: int
 
@@ -203,7 +203,7 @@ def replace(mask: Tensor | None, plane: Tensor, value: float | Tensor) -> Tensor
 
 
 def to_mask(margin: Tensor, looks: bool = False) -> Tensor | None:
-    """Return 1 for a positive margin, else 0, in its dtype: compiled code writes bools one by one.
+    """Return 1 for a positive margin, else 0, in its dtype: compiled graphs write bools one by one.
 
     If the call `looks` at values, it is None for margins that are all positive: then nothing is to be replaced.
     """

@@ -1,4 +1,4 @@
-"""Pixels to rays: the inverse of the lens and why a pixel is invalid, as recorded in graphs, and compiled."""
+"""Pixels to rays: the inverse of the lens and why a pixel is invalid, as torch records it, and in native code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Operators that compiled code calls instead of tracing: a warp of images, and sampling positions with a tolerance.
+"""Operators that compiled graphs call instead of tracing: a warp of images, and sampling positions with a tolerance.
 
 Exported programs know them by the name of this module.
 """
@@ -48,7 +48,7 @@ def positions(
 
 
 def takes(images: Tensor, inputs: Sequence[Tensor]) -> bool:
-    """Whether compiled code calls the operator for positions that depend on `inputs`: on the CPU, with no graph."""
+    """Whether compiled graphs call an operator for positions that depend on `inputs`: on the CPU, if nothing learns."""
     return all(t.is_cpu and not (t.requires_grad and torch.is_grad_enabled()) for t in (images, *inputs))
 
 

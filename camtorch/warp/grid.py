@@ -120,7 +120,7 @@ class Lattice:
 
 
 class _Pixels(Function):
-    """Positions of a lattice's pixels, and whether there are any, in compiled code; derived again, by torch."""
+    """Positions of a lattice's pixels, and whether there are any, by native code; second derivatives by torch."""
 
     @staticmethod
     def forward(ctx: Any, nodes: Tensor, exact: Tensor, cells: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -237,7 +237,7 @@ def tabulate(
 
 
 def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -> Between | None:
-    """Return the compiled geometry from camera to camera for pixels of the dtype of `like`; None in a graph."""
+    """Return the native geometry from camera to camera for pixels of the dtype of `like`; None in a graph."""
     made = compiled_of((start, end), like, *(() if rotation is None else (rotation,)))
     if made is None:
         return None

@@ -92,7 +92,7 @@ class Plan:
 class CameraPair(GeometryModule):
     """The state of a `Warp`: source, target, rotation and options; and where target pixels lie."""
 
-    is_an_operator: ClassVar[bool] = True  # compiled code may call it as one, as cameras and rotation are all of it
+    is_an_operator: ClassVar[bool] = True  # compiled graphs may call it as one, as cameras and rotation are all of it
     keeps_lens: ClassVar[bool] = False  # True: it can follow another warp, as one warp that `follow` returns
     batch_shape: torch.Size
     padding_mode: PaddingMode
@@ -217,7 +217,7 @@ class CameraPair(GeometryModule):
     def route(self, images: Tensor | None = None) -> Route:
         """Return the route of images, or of positions alone; `locate` and `render` choose the lattice and the sampler.
 
-        * "operator": compiled code calls one operator, and traces nothing of it;
+        * "operator": a compiled graph calls one operator, and traces nothing of it;
         * "strips": the grid would be too long for memory, and is made part by part;
         * "graph": something learns, so that positions are computed anew with their graph;
         * "kept": positions without a graph, pinned or kept until an input changes.
@@ -233,7 +233,7 @@ class CameraPair(GeometryModule):
         return "strips" if looks and (images is None or not in_graph(images)) else "kept"
 
     def is_called(self, images: Tensor) -> bool:
-        """Whether code is compiled that calls this warp as an operator for images; it knows cameras of one model."""
+        """Whether a compiled graph calls this warp as an operator for images, which knows cameras of one model."""
         return self._is_operator and compiled.takes(images, self.tensors)
 
     @property

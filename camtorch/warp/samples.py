@@ -38,7 +38,7 @@ _PIXELS = 1 << structs.LEFT_BITS  # flags of what is left of pixels are times th
 
 
 def between_of(warp: CameraPair) -> tuple[Native, Native, Tensor | None] | None:
-    """Return source, target and rotation of a warp for compiled code; None where it has to go step by step."""
+    """Return source, target and rotation of a warp for native code; None if it has to go step by step."""
     source, target, rotation = warp.source, warp.target, warp.rotation
     if not warp.is_an_operator or warp.is_pinned or goes_round(source) is not None or goes_round(target) is not None:
         return None
@@ -54,7 +54,7 @@ def call_for(
     hows: Sequence[Sampler | Label],
     batched: bool,
 ) -> SampleCall | None:
-    """Return the call of compiled code that moves all that samples of a form hold; a thread keeps the last ones.
+    """Return the call of native code that moves all that samples of a form hold; a thread keeps the last ones.
 
     None where a lattice does not do, images shrink or lie oddly in memory, or threads would idle: of a batch each takes
     whole samples.

@@ -70,7 +70,7 @@ def laid_as(images: Tensor, result: Tensor) -> Tensor:
 
 
 def prepared(images: Tensor, where: Sampling | Lattice, how: Sampler, out: Tensor | None = None) -> sampler.Call | None:
-    """Return the call of compiled code for images (B or 1, C, H, W) of this form, of which results lie like `out`.
+    """Return the call of native code for images (B or 1, C, H, W) of this form, of which results lie like `out`.
 
     None with a graph, a transform, another device or dtype, or antialiasing.
     """

@@ -1,4 +1,4 @@
-"""Cameras that compiled code makes of drawn numbers are those of the formulas that torch records, and known as well."""
+"""Cameras that native code makes of drawn numbers are those of the formulas that torch records, and known as well."""
 
 import pytest
 import torch

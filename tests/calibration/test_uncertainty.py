@@ -165,7 +165,7 @@ def test_derivatives_go_on_to_the_end_of_the_chart(learns):
     camera = ct.Pinhole(torch.tensor([[10.0, 11, 320, 240]], **F64))
     angles = torch.tensor([60.0, 86.9, 87.5, 89.5], **F64).deg2rad()
     rays = torch.stack((0.6 * angles.sin(), 0.8 * angles.sin(), angles.cos()), -1)[None]
-    with torch.set_grad_enabled(learns):  # by the formula, by compiled code
+    with torch.set_grad_enabled(learns):  # by the formula, by native code
         by_point, by_own = pixel_jacobians(camera, rays)
     expected = torch.func.vmap(torch.func.jacrev(lambda ray: camera[0].detach().project(ray)[0]))(rays[0])
     torch.testing.assert_close(by_point[0], expected, rtol=1e-12, atol=0)

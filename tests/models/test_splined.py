@@ -141,7 +141,7 @@ def test_any_lens_becomes_one():
 
 
 def test_a_surface_goes_behind_any_lens_at_any_place():
-    """Its Jacobian, bounds and the compiled code, away from the origin and with cells that are not square."""
+    """Its Jacobian, bounds and the native code, away from the origin and with cells that are not square."""
     from camtorch.optics import Lens, Planar, Polynomial, Surface
 
     class Bent(ct.KannalaBrandt):

@@ -1,4 +1,4 @@
-"""Laws of the compiled geometry: what Python's formulas say of a ray or a pixel, it says too, and their derivatives."""
+"""Laws of the native geometry: what Python's formulas say of a ray or a pixel, it says too, and their derivatives."""
 
 import math
 from unittest.mock import patch
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.skipif(not native_available(), reason="the library is n
 each_kind = pytest.mark.parametrize("key", slow_unless(KEYS.__contains__, [*KEYS, *(f"{k} others" for k in KEYS)]))
 each_dtype = pytest.mark.parametrize("dtype", slow_unless([torch.float64].__contains__, [torch.float64, torch.float32]))
 
-# models that compiled code must know
+# models that native code must know
 CODED = {
     "brown_conrady", "cylindrical", "division", "double_sphere", "equirectangular", "equisolid", "eucm",
     "f_theta", "f_theta_backward", "f_theta_backward_sheared", "f_theta_sheared", "fisheye62", "fisheye624",

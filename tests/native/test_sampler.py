@@ -1,4 +1,4 @@
-"""Laws of the compiled sampler: what torch samples, it samples too, wherever images lie and whoever calls."""
+"""Laws of the native sampler: what torch samples, it samples too, wherever images lie and whoever calls."""
 
 import math
 import os
@@ -38,7 +38,7 @@ def torch_alone():
 
 @contextmanager
 def counted():
-    """How often the compiled sampler was called."""
+    """How often the native sampler was called."""
     calls = []
     with pytest.MonkeyPatch.context() as patch:
         original = sampler.Call.__call__
@@ -115,7 +115,7 @@ def compare(result, expected, mode, unsure, span):
 
 
 def both(images, where, mode, padding, fill=(0.0,), span=None):
-    """What the compiled sampler makes, which is what torch makes."""
+    """What the native sampler makes, which is what torch makes."""
     with counted() as calls:
         result = sampling.render(images, where, mode, padding, fill)
     # what is computed in float32 is sampled so too, if nothing is to be filled in afterwards

@@ -22,7 +22,7 @@ TOLERANCES = (0.1, 0.01)
 
 @pytest.fixture(params=["compiled", "torch"])
 def way(request, monkeypatch):
-    """The lattice as compiled code lays it, and as torch does where there is none."""
+    """The lattice as native code lays it, and as torch does where there is none."""
     if request.param == "compiled" and not native_available():
         pytest.skip("there is no compiled library")
     if request.param == "torch":
