@@ -1,4 +1,4 @@
-"""The plan of a form of samples: what moves, whether there is a dim B, and the one call of C that moves most of it."""
+"""The plan of a form of samples: which fields move, whether there is a dim B, and the call of C for most of them."""
 
 from __future__ import annotations
 

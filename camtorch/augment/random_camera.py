@@ -26,8 +26,8 @@ _DEPTHS = {"of_depth": ("depth", "z"), "of_distance": ("distance", "distance")}
 class RandomCamera(CameraDrawer):
     """Another camera in the same place: turned, with another lens, cropped, and of another size.
 
-    Convention: ranges are (low, high), or a number x for x to either side of doing nothing. Angles are in
-    degrees, as every `fov` in camtorch.
+    Ranges are (low, high). A number x stands for x to either side of doing nothing, but for `fov`, `crop`, `vignetting`
+    and `cos4` for x alone. Angles are in degrees, as every `fov` in camtorch.
 
         >>> camera = ct.KannalaBrandt([80.0, 80.0, 63.5, 47.5], [0.02, -0.01, 0.0, 0.0], image_size=(96, 128))
         >>> augment = ct.augment.RandomCamera(yaw=(-5.0, 5.0), camera=camera)

@@ -143,8 +143,8 @@ def reprojection(
 ) -> Tensor | tuple[Tensor, Tensor]:
     """Return the distances in pixels between the projections of points by the predicted camera and by the target.
 
-    A point that the predicted camera does not see has no gradient, and by default it does not count: the loss falls if
-    a lens folds over its points. Pass a `penalty` in training, so that each lost point shows.
+    A point that the predicted camera does not see has zero gradient, and does not count by default: the loss falls if a
+    lens folds over its points. Pass a `penalty` in training, so that each lost point shows.
 
     Args:
         predicted: Cameras with batch dims *B.

@@ -31,7 +31,7 @@ class ModelSpec:
     defined_text: ClassVar[str] = ""
     """The condition of `defined` in words, like "xi > -1"."""
     always_defined: ClassVar[bool] = False
-    """Whether the formula exists for all coefficients, which is so if a model does not state `defined`."""
+    """Whether the formula exists for all coefficients; set by camtorch: True if a model does not state `defined`."""
     odd_in_x: ClassVar[frozenset[str]] = frozenset()
     """The coefficients that change sign when the scene is mirrored left to right."""
     odd_in_y: ClassVar[frozenset[str]] = frozenset()

@@ -70,7 +70,7 @@ class Sampling(NamedTuple):
 class Lattice:
     """Where every pixel of a target (h, w) samples the source's image, by `nodes` (B, 2, n + 5, m + 5) of every eighth.
 
-    Nodes begin at pixel (-16, -16); a cubic is laid through four along each axis. `cells` (B, n, m) int32 are
+    Nodes begin at pixel (-16, first row - 16); a cubic goes through four along each axis. `cells` (B, n, m) int32 are
     `CELL_EMPTY`, `CELL_CUBIC`, or a place in `exact` (2, K, 8, 8), positions for each pixel, NaN where none is mapped;
     with a graph also `CELL_QUINTIC`, for quintics through six nodes, whose derivatives are as good as exact ones.
 

@@ -1,4 +1,4 @@
-"""One call of C for all that samples of a form hold: images, masks, pixels, boxes, rays and poses."""
+"""One call of C for a sample: its images, masks, pixels, boxes, rays and poses. For a batch images and pixels."""
 
 from __future__ import annotations
 

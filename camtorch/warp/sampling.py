@@ -410,7 +410,7 @@ class _Sample(torch.autograd.Function):
     @staticmethod
     def forward(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
         if images.is_cpu and are_known(images, grid):
-            return _sample(images.detach(), grid.detach(), mode, padding_mode)  # compiled code takes no graph
+            return _sample(images.detach(), grid.detach(), mode, padding_mode)  # native code takes no graph
         return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
 
     @staticmethod

@@ -227,7 +227,7 @@ class Warp(CameraPair):
 
     def pin(self) -> Warp:
         """Compute the grid once, with its graph, for a warp whose cameras will not change; return the warp."""
-        # the operator of compiled code keeps its own; what inference mode makes could not be used in a graph later
+        # the operator of a compiled graph keeps its own; what inference mode makes could not be used in a graph later
         is_operator = self.is_called(self.target.intrinsics.detach())
         if self.is_pinned or is_operator or torch.is_inference_mode_enabled():
             return self

@@ -1,4 +1,4 @@
-"""A single sample is made by one call of compiled code, to the very numbers that its change makes step by step."""
+"""What native code moves at once, samples and batches, has the very numbers that their change makes step by step."""
 
 import math
 from functools import partial
