@@ -99,7 +99,7 @@ class MirrorWarp(Warp):
         if not (self._decides and smooth and route == "kept" and are_known(self.target.intrinsics)):
             return None
         if self._halvings is None:
-            own = self.host or self  # no device is waited for
+            own = self.host or self  # the warp on the CPU, whose values need no wait
             self._halvings = _halvings(own.positions("kept", sampler.padding_mode), own.sampled)
         return [Way(sampler.padding_mode, k) for k in self._halvings] if any(self._halvings) else None
 

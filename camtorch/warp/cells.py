@@ -136,9 +136,9 @@ def prefer_quintics(nodes: Tensor, cells: Tensor, source: tuple[int, int], toler
 
 
 def places(todo: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the places (B, K) of cells to do (B, n, m), of every camera as many as of the one with the most.
+    """Return the places (B, K) of the cells to do, True in (B, n, m); K is that of the camera with the most.
 
-    And bool (B, K): which of them are to be done. More of them computed does no harm.
+    And bool (B, K): which of them are to be done; cameras with fewer cells have others too, which do no harm.
     """
     flat = todo.flatten(1)
     chosen = flat.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, : int(flat.sum(1).max())]

@@ -44,7 +44,7 @@ _PLANES: dict[str, tuple[float, Callable[[float], float]]] = {
 }
 """Projections with an infinite plane: their limit of fov in degrees, and the plane's width for a fov in radians."""
 _MIDDLE, _LEAST_SHARE = math.pi / 3, 0.1  # a wider fov warns: above 160 degrees in perspective, 278 in stereographic
-_SEAM = 1e-3  # radians to either side of it
+_SEAM = 1e-3  # radians from a panorama's seam to the rays on both sides that are looked for
 
 
 class Dewarp(Warp):

@@ -30,11 +30,11 @@ from camtorch.warp.cells import Exact, classify, lay_quintics, places, prefer_qu
 from camtorch.warp.panorama import goes_round, lengths, off_poles, within_turn
 
 OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
-_FAR = 100.0  # positions beyond are drawn in: grid_sample casts them to integers
+_FAR = 100.0  # positions beyond are clamped to it: grid_sample casts them to integers
 _STRIP = 1 << 19  # pixels
-FEWEST = 8  # cells along a side from which on a lattice pays
+FEWEST = 8  # cells along a side: with fewer, exact positions take less time than a lattice
 _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
-_kept_weights = Kept(4)  # on other devices, where each operator is a launch
+_kept_weights = Kept(4)  # those of `_weights` on other devices, where each operator is a launch
 MOST_KEPT = 1 << 16  # nodes of a lattice whose pixels are kept for the next one
 
 
@@ -43,15 +43,15 @@ class Sampling(NamedTuple):
 
     grid: Tensor  # (B or 1, h, W', 2): positions as of `grid_sample`, `OUTSIDE` where there is none
     mapped: Tensor  # (B or 1, h, W') bool: the pixel has a ray, and the source maps it
-    scale: Tensor | None  # (B or 1, h, W'): see `local_scale`; None where nobody asks for it
+    scale: Tensor | None  # (B or 1, h, W'): see `local_scale`; None if images are not antialiased
 
     @property
     def pixels(self) -> Sampling:
-        """Itself, as a `Lattice` has it."""
+        """This sampling: a `Lattice` has its positions pixel by pixel under this name too."""
         return self
 
     def cameras(self, rows: slice | Tensor) -> Sampling:
-        """Return those of these cameras of the batch."""
+        """Return the positions of these cameras of the batch."""
         scale = None if self.scale is None else self.scale[rows]
         return Sampling(self.grid[rows], self.mapped[rows], scale)
 
@@ -61,7 +61,7 @@ class Sampling(NamedTuple):
         return Sampling(grid, mapped, scale[0] if scale else None)
 
     def part(self, down: slice, across: slice = slice(None)) -> Sampling:
-        """Return those of these rows and columns of the target."""
+        """Return the positions of these rows and columns of the target."""
         scale = None if self.scale is None else self.scale[:, down, across]
         return Sampling(self.grid[:, down, across], self.mapped[:, down, across], scale)
 
@@ -91,15 +91,15 @@ class Lattice:
         return Lattice(nodes, cells, exact, self.size, done)
 
     def cameras(self, rows: slice | Tensor) -> Lattice | Sampling:
-        """Return those of these cameras of the batch."""
+        """Return the lattice of these cameras of the batch; on another device the positions of its pixels."""
         if self.done is not None:
             return self.pixels.cameras(rows)
         return Lattice(self.nodes[rows], self.cells[rows], self.exact, self.size)
 
     @property
     def single(self) -> Lattice:
-        """In float32."""
-        # kept, it would keep itself, until the garbage collector comes
+        """The lattice with nodes and exact positions in float32, in which the native sampler reads them."""
+        # not cached: only the garbage collector frees an object that holds itself
         return self if self.nodes.dtype == torch.float32 else self._narrowed
 
     @cached_property
@@ -108,7 +108,7 @@ class Lattice:
 
     @cached_property
     def pixels(self) -> Sampling:
-        """Pixel by pixel: a constant of what torch.jit.trace records, also where nobody has asked for it before."""
+        """The positions of all pixels; torch.jit.trace records them as a constant, even if they are made there."""
         with set_aside() if in_jit_trace() else nullcontext():
             nodes, exact, cells = self.nodes, self.exact, self.cells
             single = nodes.dtype == torch.float32 and self.done is None
@@ -136,7 +136,7 @@ class _Pixels(Function):
         if not torch.is_grad_enabled() and is_eager(by_grid):
             return *sampler.lay_vjp(by_grid, cells, exact.shape[1]), None, None
         leaves = nodes.detach().requires_grad_(), exact.detach().requires_grad_()
-        with torch.enable_grad():  # it is linear
+        with torch.enable_grad():  # positions are linear in both leaves
             grid, _ = _pixel_by_pixel(leaves[0], leaves[1], cells, ctx.size)
         by_nodes, by_exact = torch.autograd.grad(grid, leaves, by_grid, create_graph=True, materialize_grads=True)
         return by_nodes, by_exact, None, None
@@ -179,7 +179,7 @@ def locate(
     rows: range,
     padding: str,
 ) -> Sampling | Lattice:
-    """Return where rows of a target sample the source's image: by a lattice if one does."""
+    """Return where rows of a target sample the source's image: a lattice if that serves, else all positions."""
     if not antialias:
         if tolerance and not torch.compiler.is_compiling():
             lattice = on_lattice(source, target, rotation, tolerance, rows, padding)
@@ -194,7 +194,7 @@ def locate(
 def scaled_rows(
     source: Camera, rows: range, height: int, positions: Callable[[range], tuple[Tensor, Tensor]]
 ) -> Sampling:
-    """Return the `positions` of rows of a target with their scale, which is that between neighbours."""
+    """Return the `positions` of rows of a target with the scale between neighbouring pixels."""
     around = range(max(rows.start - 1, 0), min(rows.stop + 1, height))
     grid, mapped = positions(around)
     where = Sampling(grid, mapped, local_scale(grid.detach(), mapped, source))
@@ -221,7 +221,7 @@ def tabulate(
         if lattice is not None:
             return lattice.pixels[:2]
     exact = partial(_positions, source, target, rotation, _native(source, target, rotation, like))
-    # by strips: memory for what is in between is used again
+    # by strips, which reuse the memory of intermediate results
     count = max(math.prod(c.batch_shape) for c in (source, target))
     count = count if rotation is None else max(count, math.prod(rotation.shape[:-2]))
     step = max(_STRIP // max(count * width, 1), 1)
@@ -393,7 +393,7 @@ def _with_graph(
 
 
 def coarse(size: tuple[int, ...]) -> tuple[int, int]:
-    """Return the first, and the step, of the pixels of targets (h, w) that tell how far images shrink."""
+    """Return the first pixel and the step, in both directions, at which a target (h, w) shows how far images shrink."""
     return (16, 32) if min(size) >= 64 else (0, STEP) if min(size) > STEP else (0, 1)
 
 
@@ -444,7 +444,7 @@ def _compute(exact: Exact, first: int, cells: Tensor, todo: Tensor, like: Tensor
         put(cells, chosen, wanted, torch.arange(count, count + chosen.numel(), device=cells.device).view_as(chosen))
         count += chosen.numel()
         done |= todo
-        # the limit goes on where it is thinner than cells
+        # the limit may go on in cells around, though their nodes do not show it
         limit = torch.zeros_like(todo).flatten(1).scatter_(1, chosen, wanted & known.any(-1) & ~known.all(-1))
         around = F.max_pool2d(limit.view_as(todo).to(like.dtype).unsqueeze(1), 3, 1, 1)[:, 0]
         todo = (around > 0) & ~done
@@ -476,7 +476,7 @@ def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def _weights(taps: int, dtype: torch.dtype, wide: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return weights (8, taps) of nodes in their polynomial on the way from the middle one to the next; of a block."""
+    """Return weights (8, taps) of nodes at the pixels of a cell, and the matrix that has these for a block of cells."""
     t, at = torch.arange(STEP, dtype=torch.float64, device=device) / STEP, range(1 - taps // 2, taps // 2 + 1)
     parts = [math.prod(((t - m) / (k - m) for m in at if m != k), start=torch.ones_like(t)) for k in at]
     weights, cells = torch.stack(parts, -1).to(dtype), _BLOCK // STEP

@@ -198,7 +198,7 @@ class CameraPair(GeometryModule):
 
     @property
     def sampled(self) -> Camera:
-        """The source, of these longer images."""
+        """The source as the camera of the images that `seam` lengthens."""
         source = self._ends[0]
         seam = self.seam
         return source if seam is None else seam.before(source)
@@ -355,7 +355,7 @@ class CameraPair(GeometryModule):
 
     def _reach(self, padding: PaddingMode) -> PaddingMode:
         """Return the padding of positions that serve the warp's own padding and this one."""
-        # of equal words compilers know no max by a key
+        # torch.compile knows no max with a key
         return PADDINGS[max(PADDINGS.index(self.padding_mode), PADDINGS.index(padding))]
 
     def _constant(self, padding: PaddingMode) -> Sampling | Lattice | None:

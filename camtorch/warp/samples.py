@@ -32,9 +32,9 @@ of which those of a pose begin with a rotation; or rotation vectors."""
 Sizes = tuple[tuple[int, int], tuple[int, int]]  # (height, width) of the source's image, and of the target's
 
 _FORMS = {"pose": structs.POSE, "rotation vectors": structs.ROTATION_VECTORS}  # others are rays
-_FEW = 2  # tiles of an image that one thread makes alone
-_EVEN = 4  # samples a thread from which on it matters little that the last ones leave some threads idle
-_PIXELS = 1 << structs.LEFT_BITS  # flags of what is left of pixels are times this
+_FEW = 2  # tiles: an image of no more is made by one thread
+_EVEN = 4  # samples a thread: with as many, threads that idle at the end matter little
+_PIXELS = 1 << structs.LEFT_BITS  # C multiplies flags about pixels by this, to tell them from those about the lattice
 
 
 def between_of(warp: CameraPair) -> tuple[Native, Native, Tensor | None] | None:
@@ -56,8 +56,8 @@ def call_for(
 ) -> SampleCall | None:
     """Return the call of native code that moves all that samples of a form hold; a thread keeps the last ones.
 
-    None where a lattice does not do, images shrink or lie oddly in memory, or threads would idle: of a batch each takes
-    whole samples.
+    None if no lattice serves, images shrink or have unusual strides, or threads would idle: each takes whole samples of
+    a batch.
 
     Args:
         sizes: of both images.
@@ -114,7 +114,7 @@ class SampleForm:
     sizes: Sizes
     dtype: torch.dtype
     tolerance: float
-    decides: bool  # whether images that shrink go another way
+    decides: bool  # whether images that shrink are antialiased, which this call does not do
     batched: bool
     count: int
     values: Sequence[Tensor]
@@ -126,7 +126,7 @@ class SampleForm:
         return value if value.ndim == 4 else value.unsqueeze(1)
 
     def takes(self, value: Tensor, how: Sampler | Label) -> bool:
-        """Whether a call takes a value: images that lie too oddly in memory, or are none, go another way."""
+        """Whether a call takes a value: not images without pixels, or with strides that are slow to read."""
         if not isinstance(how, Sampler):
             return torch.promote_types(value.dtype, self.dtype) == self.dtype
         image = self.images(value)
@@ -134,7 +134,7 @@ class SampleForm:
         return 0 not in result.shape and takes(image.dtype, how.mode) and is_quick(image, result, how.mode)
 
     def maker(self, value: Tensor) -> Callable[[], Tensor]:
-        """Return what makes the place for samples of an image or a mask."""
+        """Return a function that makes an empty tensor for the result of an image or a mask."""
         make, is_image = maker(self.images(value), self.count, self.sizes[1]), value.ndim == 3 + self.batched
 
         def made() -> Tensor:
@@ -152,7 +152,7 @@ class SampleCall:
 
     @classmethod
     def of(cls, form: SampleForm) -> SampleCall | None:
-        """Return the call, or None where it does not do."""
+        """Return the call; None if a lattice would be too small or too large, or a value does not fit."""
         n, m = (math.ceil(side / structs.STEP) for side in form.sizes[1])
         if min(n, m) < FEWEST or (n + 5) * (m + 5) > MOST_KEPT:  # too small for a lattice, or too large to be kept
             return None
@@ -171,7 +171,7 @@ class SampleCall:
         call = self._call = structs.Together(job_count=images, move_count=moving, turned_count=len(vectors))
         call.jobs, call.moves, call.turned = (call.keep(array) for array in (self._jobs, pixels, vectors))
         jobs, moves, turns = iter(self._jobs), iter(pixels), iter(vectors)
-        # the structure of each value, and whether it goes in as it is
+        # the structure of each value, and whether C reads the value itself, not a copy
         self._slots = list[tuple[structs.Job | structs.Move | structs.Turned, bool]]()
         self._makers = list[Callable[[], Tensor]]()  # of images
         self._tiles = 1
@@ -201,7 +201,7 @@ class SampleCall:
             self._slots.append((slot, value.dtype == dtype and value.is_contiguous()))
         call.lattices = self._lattices.struct
         self._back = call.lattices.move
-        if count > 1:  # each as soon as its lattice is there
+        if count > 1:  # C samples images as soon as their lattice is made
             call.lattices.jobs, call.lattices.job_count = call.jobs, call.job_count
         else:
             self._back.next = None  # one thread makes the lattice, and needs no counter of those made
@@ -282,7 +282,7 @@ class SampleCall:
         return results, given
 
     def _follow(self, flags: int, source: Native, target: Native) -> int:
-        """Find what the call has asked for: of the lattice, else of the pixels, which go the other way."""
+        """Compute limits that the call lacked: of cameras for the lattice, or for pixels, whose flags it returns."""
         left, (start, end) = (flags, (target, source)) if flags < _PIXELS else (flags // _PIXELS, (source, target))
         if left & structs.LEFT_FROM:
             start.follow()

@@ -27,11 +27,11 @@ MODES = tuple(sampler.MODES)
 PADDINGS: tuple[PaddingMode, ...] = get_args(PaddingMode)
 
 SHRINKS = 1.5  # pixels of the image to one of the result, from which on edits antialias by themselves
-SURELY = 0.999  # of that: whatever rounding does, less does not
+SURELY = 0.999  # of that: images that shrink less do not antialias, whatever rounding does
 _LARGE = 1 << 23  # numbers in an image whose copy in float32 leaves every cache
 _STRIP = 1 << 17  # numbers of a result in float32 that are made at a time
 _TILE = 512  # pixels along the sides of what is then sampled at a time
-_TRACED_LEVELS = 4  # where the values that decide cannot be looked at: down to a sixteenth
+_TRACED_LEVELS = 4  # if the values that decide cannot be read: down to a sixteenth
 
 
 class Sampler(NamedTuple):
@@ -167,7 +167,7 @@ def _by_torch(images: Tensor, where: Sampling, how: Sampler, kept: dict[int, Pyr
 
 
 def _levels(kept: dict[int, Pyramid] | None, i: int, images: Tensor) -> Pyramid:
-    """Return the images from the i-th on: those kept, with the halves that they have got."""
+    """Return the pyramid of the images from the i-th on: the `kept` one, with the halves that it has, or a new one."""
     return Pyramid(images) if kept is None else kept.setdefault(i, Pyramid(images))
 
 
@@ -246,7 +246,7 @@ class Pyramid:
 
     @property
     def half(self) -> Pyramid:
-        """They are of a dtype to compute in."""
+        """The pyramid of the images at half their size, in a dtype to compute in."""
         if self._half is None:  # no cached_property, whose lock compilers refuse
             size = [max(side // 2, 1) for side in self.images.shape[-2:]]
             # a copy in another dtype is large
@@ -263,9 +263,9 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) 
     On a CPU an infinite or NaN pixel has a part in those bicubic samples alone in which it has a weight.
     """
     grid = grid.to(images.dtype)
-    if not (isinstance(images.shape[0], int) and len(grid) == len(images)):  # an exported program is to say no more
+    if not (isinstance(images.shape[0], int) and len(grid) == len(images)):  # comparing would fix open sizes
         grid = grid.expand(images.shape[0], -1, -1, -1)
-    if torch.compiler.is_compiling():  # which knows no jvp of one's own, nor needs it
+    if torch.compiler.is_compiling():  # torch.compile knows no jvp of our own, and needs none
         return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
     if are_plain(images, grid):
         return _sample(images, grid, mode, padding_mode)
@@ -362,7 +362,7 @@ class WarpOptions(TypedDict, total=False):
 
 
 class TolerantOptions(WarpOptions, total=False):
-    """And how exact positions are."""
+    """The options of warps that may interpolate positions, within `tolerance` pixels."""
 
     tolerance: float | None
 
