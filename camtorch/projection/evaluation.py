@@ -21,7 +21,7 @@ from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.rows import CameraRows, Direction, unusable
 from camtorch.values.arguments import Numbers, as_points, present, warn
 
-_MANY = 1_000_000  # points of a call that a user waits for
+_MANY = 1_000_000  # points: a call of as many is so slow without the library that it warns
 _BLOCK = 1 << 17  # points of all cameras, for each thread
 
 if TYPE_CHECKING:

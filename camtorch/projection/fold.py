@@ -23,7 +23,7 @@ _SMOOTH, _BULGE = 0.02, 0.001
 _DIP = 65  # radii at which a dip between two nodes is sampled
 _COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
 _FAR = 20.0  # focal lengths: no image goes further, and there lenses may differ much between two azimuths
-_BEYOND, _ASIDE = 1.01, 4  # what an extent allows for outside of its rim and, in azimuths, next to it
+_BEYOND, _ASIDE = 1.01, 4  # an extent is larger than its rim by this factor, and wider by so many azimuths
 _SPAN = 12  # azimuths that the rim may go on from one to the next, and next to it; else it is a circle
 
 
@@ -69,7 +69,7 @@ def _follow(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> tu
     x, y = lens.at(a * last, b * last, order=0).value
     before = torch.where((radii < last) & (reach < torch.inf), reach, 0.0).amax(-1, keepdim=True)
     furthest = torch.maximum((x * x + y * y).sqrt(), before)
-    # before a pole it has no end
+    # before a pole the lens sends points to infinity
     beyond = radii.gather(-1, nodes.ceil().long()).clamp(max=end)
     margin = lens.at(a * beyond, b * beyond).margin
     open_ended = furthest.isnan() if margin is None else furthest.isnan() | ~(margin > 0)

@@ -21,7 +21,7 @@ from camtorch.values.threads import spread, thread_count
 
 _Call = TypeVar("_Call")
 _TILE = 1 << 14  # points of a tile, some 30 us
-_SHARED = 1 << 15  # points that threads are woken for
+_SHARED = 1 << 15  # points: with fewer, to wake threads would take longer
 
 
 def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -171,7 +171,7 @@ class Lattices:
         self.struct, self._is_double = made, is_double
 
     def lay(self, job: structs.Job) -> None:
-        """Have images find the lattices, which are in float for them."""
+        """Have a job sample by these lattices, whose nodes are then in float32."""
         made, double, (_, n, m) = self.struct, self._is_double, self.cells.shape
         plane = (n + 5) * (m + 5)
         job.nodes = made.narrow if double else made.cells.nodes
@@ -296,7 +296,7 @@ def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
 
 
 def _call(native: Native, cameras: int, count: int, call: structs.Rows, tile: int = _TILE) -> int:
-    """Call the native geometry with rows, their results and what belongs to them."""
+    """Call the native geometry with rows, their results and the other arguments of `Rows`."""
     if cameras != native.cameras:  # C would read elsewhere
         raise ValueError(f"rows must be of {native.cameras} cameras; got those of {cameras}")
     call.cameras, call.count, call.tile = native.pointer, count, tile

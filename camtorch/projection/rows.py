@@ -159,7 +159,7 @@ class Direction(NamedTuple):
     """The native call that also returns the tensors that `native_vjp` needs."""
     native_vjp: Callable[..., tuple[Tensor | None, Tensor | None]]
     """The native cotangents of rows and of the numbers of the cameras."""
-    name: str  # of the rows in messages
+    name: str  # the rows' name in messages
     size: int
 
 
