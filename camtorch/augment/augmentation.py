@@ -80,17 +80,17 @@ class Augmentation(SampleTransform):
 
     ranges: dict[str, Range]
     beside_the_camera: ClassVar[frozenset[str]] = frozenset()
-    """The ranges of what the new images have beside a camera."""
+    """The names of ranges that change the colours or the light of new images, not their camera."""
     keeps_lens: ClassVar[bool] = False
     """Whether it may follow the colours and the light of a lens, though it needs the camera."""
     image_size: tuple[int, int] | None = None
-    """Of what comes out; None: that of what comes in."""
+    """(height, width) of new images; None: that of the images."""
     drawn_on_host: bool = False
-    """Whether it makes new cameras of the numbers of others alone, so that the CPU does for samples on any device."""
+    """Whether new cameras follow from numbers of cameras alone: the CPU then makes them for samples on any device."""
     place: bool = False
     """Whether `crop_place` comes out; see `BoxCrop`."""
     crops: Mapping[str, int] = MappingProxyType({})
-    """Boxes that a draw needs, by their names in it: which of each sample's."""
+    """The boxes of a sample that a draw needs: name in the draw -> index among the boxes."""
     p: float
     same_on_batch: bool
     min_filled: float | None
@@ -191,7 +191,7 @@ class Augmentation(SampleTransform):
         return self._change_where_drawn(one_or_batch(own), self._checked_draw(draw))
 
     def _change_where_drawn(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
-        """Return the change of a draw, computed on the CPU if the draw is there and the camera elsewhere, unlearnt."""
+        """Return the change of a draw, computed where the draw is: on the CPU also for fixed cameras elsewhere."""
         twin = None if camera.intrinsics.is_cpu or not self.drawn_on_host else twin_of(camera)
         if twin is None or not all(getattr(value, "is_cpu", True) for value in draw.values()):
             return self._change(camera, draw)
@@ -258,11 +258,11 @@ class Augmentation(SampleTransform):
         return self._part_between(source, target, rotation, values)
 
     def _part_between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
-        """Return the part whose samples go from a source to a target, with what of the values is beside the cameras."""
+        """Return the part from a source to a target; `values` may change images in more ways, such as their light."""
         return Part(source, Warp(source, target, rotation, **self.options))
 
     def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what was drawn, (*B,) or (*B, size), where all is alike once: one map then serves all samples."""
+        """Return drawn values, (*B,) or (*B, size); without *B if all are alike, so that one map serves all samples."""
         if isinstance(draw["apply"], list):  # of one sample
             return {name: value[0] for name, value in draw.items() if name != "apply"}
         values = {name: value for name, value in draw.items() if name != "apply"}
@@ -293,7 +293,7 @@ class Augmentation(SampleTransform):
         )
 
     def tell_of_empty_images(self, camera: Camera) -> None:
-        """Warn, once, if new images of such cameras will be mostly empty, as some draws apart from all others say."""
+        """Warn, once, if new images of such cameras will be mostly empty, as some draws of another generator show."""
         if self.min_filled is not None or self._calls.warned or self.p == 0:
             return
         camera = camera[0] if camera.is_mixed else camera
@@ -305,7 +305,7 @@ class Augmentation(SampleTransform):
             first = camera.detach()
             first = first[[0] * _TRIES] if first.batch_shape else first
             shares = filled(first, *self._new_camera(first, self._values(first, values)))
-            own = filled(first, first, None)  # of a fisheye's circle less than all
+            own = filled(first, first, None)  # less than 1 if a fisheye shows a circle
         if shares.mean() < _FEW * own.mean():
             warn(
                 f"{self._name}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
@@ -345,7 +345,7 @@ class Augmentation(SampleTransform):
             own = self.camera if own is None else own
             frames = clips.frames(one_or_batch(own) if isinstance(own, Camera) else own)
             drawn = self.drawn(clips.shape[0], self.p, self.same_on_batch, generator) if draw is None else draw
-            each = clips.shape[1]  # of what a draw needs of a sample, that of the first frame counts
+            each = clips.shape[1]  # a draw takes the boxes that it needs from the first frame
             first = {n: (kind, value[::each]) for n, (kind, value) in moving(frames, self.fields, self._name).items()}
             whole = self._of_sample(drawn, lambda: first)
             draw = {n: clips.repeated(value, f"draw[{n!r}]") for n, value in whole.items()}

@@ -42,7 +42,7 @@ def as_is(camera: Camera, rows: Tensor) -> Tensor:
 
 @dataclass(slots=True)
 class LazyWarp:
-    """A warp to cameras of which native code wrote the numbers; both become modules when somebody asks for them."""
+    """A warp to cameras of which native code wrote the numbers; warp and cameras become modules at first use."""
 
     base: Camera  # of whose model the new cameras are
     intrinsics: Tensor  # (4,) of one, or (B, 4)
@@ -51,16 +51,16 @@ class LazyWarp:
     rotation: Tensor | None  # (3, 3) or (B, 3, 3), or None
     options: Options  # of the warp
     start: Native | None  # the cameras before, for native code
-    native: Native | None  # the new ones; None where they have to be found
+    native: Native | None  # the new cameras for native code; None if they are not made yet
     factor: Sequence[float]  # (B,), on the focal lengths, that `min_filled` asks for
     found: Sequence[float]  # (B,): the share of each image that is filled
     is_turn: bool = True  # of a single one: whether the rotation is no mirror
-    made: Warp | None = field(default=None, init=False)  # the warp, once somebody has asked for it
-    own: Camera | None = field(default=None, init=False)  # the target, likewise
+    made: Warp | None = field(default=None, init=False)  # the warp, from its first use on
+    own: Camera | None = field(default=None, init=False)  # the target, from its first use on
 
     @property
     def target(self) -> Camera:
-        """The new cameras of the change, which nobody else gets."""
+        """The new cameras of the change; samples get copies of them."""
         if self.own is None:
             if self.native is not None:
                 _ = self.native.lenses  # kept for cameras of the same numbers
@@ -69,7 +69,7 @@ class LazyWarp:
 
     def new_target(self, count: int | None = None) -> Camera:
         """Return the new cameras, of memory of their own; a count makes a batch of a single one."""
-        if torch.is_inference_mode_enabled():  # what that makes could not be used in a graph later
+        if torch.is_inference_mode_enabled():  # a graph could not use its tensors later
             with torch.inference_mode(False), torch.no_grad():
                 return self.new_target(count)
         numbers, k = self.intrinsics, self.distortion
@@ -143,7 +143,7 @@ class Part:
         """Return these rows of the part as a part of its own."""
 
         def of(camera: Camera) -> Camera:
-            return camera[index] if camera.batch_shape else camera  # which serves all rows
+            return camera[index] if camera.batch_shape else camera  # a single one serves all rows
 
         def rows_of(warp: Warp) -> Warp:
             rotation = warp.rotation if warp.rotation is None or warp.rotation.ndim == 2 else warp.rotation[index]
@@ -310,7 +310,7 @@ class Change:
         return turns[0] if self._order is None else self._in_order(turns)
 
     def leads_to(self, camera: Camera | Sequence[Camera], rotation: Tensor | None = None) -> bool:
-        """Whether these may be the cameras after, by number, intrinsics and rotation, where one may look."""
+        """Whether these may be the cameras after, by number, intrinsics and rotation, if values may be read."""
         pairs = [(self.target.intrinsics.reshape(-1, 4), one_or_batch(camera).intrinsics.reshape(-1, 4), 1e-8)]
         pairs += [] if rotation is None else [(self.rotation, rotation.reshape(-1, 3, 3), _HALF)]
         return all(
@@ -359,7 +359,7 @@ class Change:
 
     def inverse(self) -> Change:
         """Return the change back. Pixels that left the image stay lost, and the light of the lens stays as it is."""
-        if self._inverse is not None:  # with the maps that it has made
+        if self._inverse is not None:  # its warps hold the maps that they have made
             return self._inverse
         parts = [
             part if part.moves is None else Part(part.target, part.warp.inverse(), rows=part.rows)
@@ -377,7 +377,7 @@ class Change:
         """
 
         def of(part: Part) -> Moved:
-            # what comes out is never what went in, but a copy
+            # results share no memory with values that the caller passed
             rows = value[part.rows] if part.rows is not None else value.clone() if part.moves is None else value
             return stay(part.camera, rows) if part.moves is None else move(part, rows)
 
@@ -471,7 +471,7 @@ class Change:
             moved = write(turn(rotation, read(rows), "rays"))
             if read is _same or rotation.ndim == 2:
                 return moved
-            # reading and writing rounds
+            # rows that do not turn keep their bits: reading and writing rounds
             still = (rotation == _eye(rotation)).all(-1).all(-1)
             return torch.where(still.reshape(-1, *[1] * (rows.ndim - 1)), rows.to(moved), moved)
 

@@ -123,7 +123,7 @@ class Compose(Augmentation):
 
     @property
     def mirroring(self) -> Mirroring | None:
-        """That of the parts which mirror."""
+        """The `Mirroring` of the parts that mirror."""
         return next((part.mirroring for part in self.parts if part.mirroring is not None), None)
 
     @mirroring.setter

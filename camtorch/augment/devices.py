@@ -47,7 +47,7 @@ def remember_camera(camera: Camera, twin: Camera) -> None:
             remember_camera(group, its)
         return
     for there, here in zip(camera.tensors, twin.tensors, strict=True):
-        for shape in {there.shape, (*camera.batch_shape, there.shape[-1])}:  # as it is, and as it is asked for
+        for shape in {there.shape, (*camera.batch_shape, there.shape[-1])}:  # also as calls expand it
             remember(there.expand(shape), here.expand(shape))
 
 
@@ -85,7 +85,7 @@ class Elsewhere(Change):
 
 
 def _remade(parts: Sequence[Part], change: Callable[[list[Tensor]], list[Tensor]]) -> list[Part]:
-    """Return parts with all their numbers changed, at once; those that go elsewhere are found where they were."""
+    """Return parts with all their numbers changed by one call of `change`; `twin_of` finds the cameras before."""
     given: list[Tensor] = []
     for part in parts:
         given += [t for camera in _cameras(part) for t in camera.tensors]
@@ -103,7 +103,7 @@ def _remade(parts: Sequence[Part], change: Callable[[list[Tensor]], list[Tensor]
         rotation, light = (None if t is None else next(numbers) for t in (part.rotation, part.light))
         warps = []
         for host, target in zip([part.warp, *(part.shades or ())], targets, strict=True) if targets else ():
-            make = host.between if isinstance(host, MirrorWarp) else MirrorWarp  # which checks less
+            make = host.between if isinstance(host, MirrorWarp) else MirrorWarp  # `between` checks less
             warps.append(make(source, target, rotation, **host.options).follow_host(host))
         shades = (warps[1], warps[2]) if part.shades else None
         made.append(replace(part, moves=warps[0] if warps else None, camera=source, shades=shades, light=light))

@@ -49,7 +49,7 @@ def _no_check(value: Tensor, name: str, owner: str) -> None:
 
 @dataclass(frozen=True)
 class Field:
-    """A kind of field: all that is asked of it."""
+    """A kind of field: how its values are recognised, checked and moved."""
 
     dims: int  # the least number of dims of a single sample
     most_dims: int  # the most
@@ -64,7 +64,7 @@ class Field:
     check: Callable[[Tensor, str, str], None] = _no_check  # (value, name, owner); raises if values are of no such kind
     way: Label | Callable[[Options, float], Sampler] | None = None
     """How the call of C for whole samples moves it, as `move` would: (options, mask_fill) -> sampler for images."""
-    apart: bool = False  # whether it needs each pixel's position, so that no such call serves its samples
+    apart: bool = False  # whether it needs each pixel's position: that call then moves none of a sample's fields
 
 
 def _by(method: Callable[..., Any], *forms: Callable[[Tensor], Tensor]) -> Move:

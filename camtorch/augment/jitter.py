@@ -21,7 +21,7 @@ from camtorch.warp.boxes import along_edges
 PARTS = 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125
 """Parts of a step, in the order in which they are tried."""
 _SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move less than radial terms: as in real lenses
-_MOST_MEASURED = 64  # lenses
+_MOST_MEASURED = 64  # lenses whose measures are kept
 
 
 def jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> Tensor:

@@ -79,7 +79,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
 
     augmentation: Augmentation
     camera: Camera | Guess
-    _compute_matrix_lazily = True  # when somebody reads it
+    _compute_matrix_lazily = True  # when it is read
 
     def __init__(
         self,

@@ -116,7 +116,7 @@ def as_table(value: TableLike, owner: str) -> Table:
 _FACES = {n: " or ".join(repr(k) for k, v in LANDMARKS.items() if len(v) == n) for n in (68, 98, 106, 468, 478)}
 _told: set[int] = set()  # numbers of points that this process has warned about
 _PIXELS = "keypoints", "landmarks"  # kinds of fields that are landmarks
-_HOLD = *_PIXELS, "points"  # and that may be some
+_HOLD = *_PIXELS, "points"  # kinds of fields that may be landmarks
 _LEFT, _RIGHT = "_left", "_right"
 
 

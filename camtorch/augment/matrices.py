@@ -28,7 +28,7 @@ SHAPE = "(B, 3, 3) or (B, 4, 4), [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of the im
 SIDES = (3, 3), (4, 4)
 _SKEW = 1e-6  # parts of the focal length: a skew up to there is none
 _ALIKE = 1e-5  # relative: matrices that were float32 on the way are the same ones
-_told: set[str] = set()  # who warned of a matrix of another image in this process
+_told: set[str] = set()  # classes that have warned, in this process, of a matrix of another image
 _log = logging.getLogger(__name__)
 
 

@@ -81,7 +81,7 @@ class Start:
         self._rows = len(sized) if sized.ndim == 2 else native.cameras if base.batch_shape else 0
         self._turns, self._moves, self._knows = not _TURNS.isdisjoint(names), nominal is not None, False
         self._kinds = (c_float, np.float32) if native.dtype == torch.float32 else (c_double, np.float64)
-        self._follows = False  # whether new lenses want limits
+        self._follows = False  # whether new lenses need limits on azimuths
         self._distortion = base.distortion.detach()
         count = self._distortion.shape[-1]
         call = self._call = structs.Draws(count=count, height=size[0], width=size[1], is_each=self._rows > 0)
@@ -89,7 +89,7 @@ class Start:
         at, self._room = 0, 13 + count
         for name in self.names:
             call.first[_KINDS[name]], at = at, at + _SIZES.get(name, 1)
-        native.add_table()  # which whoever unprojects asks for
+        native.add_table()  # the table of the inverse, for cameras that unproject
         call.base, call.made, call.made.usable = native.pointer, native.struct, None
         call.sized = self._keep(sized)
         call.reach = None if reach is None else self._keep(reach.double())
@@ -114,7 +114,7 @@ class Start:
         call.border = self._keep(border(self.size, native.dtype))
         call.made.limits2 = call.made.extent = None
         if plan.places is None or plan.is_chart or plan.is_long or not base.always_defined:
-            return  # others make these
+            return  # `_tries` makes new lenses instead
         if plan.has_stages:
             call.domain = lenses.asked
             if native.dtype not in plan.fixed_ends:
@@ -125,7 +125,7 @@ class Start:
         self._room += plan.parameters + 4 + TABLE_WIDTH
 
     def _limits(self, call: structs.Draws, rows: int) -> list[Any]:
-        """Give room for the limits of new lenses."""
+        """Allocate limits and extents of new lenses, and return the tensors."""
         kept = [
             torch.empty(rows * count, dtype=self._native.dtype, device="cpu")
             for count in (structs.AZIMUTHS, structs.EXTENT)
@@ -161,7 +161,7 @@ class Start:
         tries = self._tries(values, rows, call) if rows and self._moves and not self._knows else None
         kept: list[Any] = [numbers]
         run = loaded().camtorch_draws
-        if self._follows:  # some lenses have wanted limits
+        if self._follows:  # an earlier call has needed limits
             kept += self._limits(call, rows)
         while (left := run(call)) & ~structs.NO_CAMERA:
             if left & structs.TOO_WIDE:
@@ -193,7 +193,7 @@ class Start:
         return LazyWarp(base, intrinsics, k, self.size, rotation, options, self.before, made, factor, found)
 
     def _follow(self, left: int, call: structs.Draws) -> None:
-        """Find what C has asked for of the cameras that it starts from."""
+        """Compute limits and ends that C lacked of the cameras that it starts from."""
         if left & structs.LEFT_BASE:
             self._native.follow()
         if left & structs.LEFT_SOURCE:
@@ -218,7 +218,7 @@ class Start:
         return native
 
     def _lenses(self, numbers: Any, rows: int, made: Native) -> Lenses:
-        """Return what was found of new lenses, kept for whoever evaluates cameras of their coefficients."""
+        """Return the new lenses with their domains, kept for later cameras with the same coefficients."""
         model, count = model_of(self.base), self._call.count
         k = torch.from_numpy(numbers[13 * rows : (13 + count) * rows].reshape(rows, count))
         domain = partial(domain_for, model, k, False)

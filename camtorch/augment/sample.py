@@ -139,7 +139,7 @@ class SampleTransform(KeepsCamera, nn.Module):
     needs_camera: bool = True
     """Whether samples, or it, need a camera; edits do not."""
     makes_pinholes: bool = True
-    """Whether a pinhole camera becomes one, as far as that is known before a draw."""
+    """Whether pinhole cameras become pinhole cameras, as far as that is known before a draw."""
     mirroring: Mirroring | None = None
     """What changes places in a mirror; None if it never mirrors."""
     _warps_decide: bool = False  # whether `antialias` is None
