@@ -55,7 +55,7 @@ _LIMITS: dict[str, dict[str, Any]] = {
     "vignetting": {"least": 0, "most": 1},
     "cos4": {"least": -2, "most": 2},
 }
-"""Of each range, in the order in which they are drawn."""
+"""The options of `as_range` for each range, in the order in which they are drawn."""
 _EXACT = "fov", "crop", "vignetting", "cos4"  # a single number is a range of only that number
 _AUTO = "focal", "centre", "distortion", "crop"
 _told: set[tuple[object, ...]] = set()
@@ -147,7 +147,7 @@ class CameraDrawer(Augmentation):
 
     @property
     def drawn_on_host(self) -> bool:  # type: ignore[override]
-        """See `Augmentation`: not what another class draws."""
+        """See `Augmentation`; False for a subclass with a `new_camera` of its own."""
         return type(self).new_camera is CameraDrawer.new_camera
 
     def _like_for(self, source: Camera) -> Camera | None:
@@ -200,11 +200,11 @@ class CameraDrawer(Augmentation):
         if type(self).new_camera is not CameraDrawer.new_camera:
             return super()._new_camera(source, values)
         like = precise(source.intrinsics.detach())
-        kind: dict[str, Any] = {"dtype": like.dtype, "device": like.device}  # at once: floats would be float32 first
+        kind: dict[str, Any] = {"dtype": like.dtype, "device": like.device}  # as_tensor makes float32 of floats first
         return self.new_camera(source, {name: torch.as_tensor(value, **kind) for name, value in values.items()})
 
     def _lazy_warp(self, source: Camera, values: Mapping[str, Any], share: float | None = None) -> LazyWarp | None:
-        """Return the warp of a draw by compiled code; None where something is recorded, or it does not know a model."""
+        """Return the warp of a draw by native code; None if something is recorded, or that lacks a model."""
         if type(self).new_camera is not CameraDrawer.new_camera:
             return None
         like = self._like_for(source)
@@ -251,7 +251,7 @@ class CameraDrawer(Augmentation):
             cameras += [scaled(target, 1 + beside["chromatic"][..., i]) for i in (0, 1)]
         warp, *others = [Warp.unchecked(source, camera, self.options).turned_by(rotation) for camera in cameras]
         if "vignetting" in beside:
-            # (B or 1, 1, H, W): it is lost by the square of the distance, so much in the farthest corner
+            # (B or 1, 1, H, W): the loss grows with the square of the distance to that drawn for the farthest corner
             height, width = target.height, target.width
             cx, cy = target.intrinsics.detach()[..., 2:].reshape(-1, 2, 1, 1).unbind(1)
             grid = target.pixel_grid()
@@ -291,7 +291,7 @@ class CameraDrawer(Augmentation):
         return self.image_size or source.size_for(self._name)
 
     def _base(self, source: Camera, share: Any) -> tuple[Camera, Tensor, Tensor | None]:
-        """Return whose lens the new cameras have, its intrinsics (*B, 4) before their images, and how far it reaches.
+        """Return the camera whose lens new cameras have, its intrinsics (*B, 4) for their size, and any reach.
 
         share: of "real" lenses, which one. The reach (*B,) is that of `lenses.drawing.Lenses`.
         """
