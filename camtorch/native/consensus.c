@@ -27,7 +27,7 @@ static void squares_of(const Lines *lines, const double *pose, int64_t first, in
     }
 }
 
-/* Their sum, and how many are near; no further than `enough` */
+/* The sum of these squares, and how many points are near; stops if it is more than `enough` */
 static double cost_of(const Lines *lines, const double *pose, double enough, int64_t *agree) {
     double squares[BLOCK], cost = 0;
     int64_t near = 0;
@@ -255,7 +255,7 @@ static void round_of(const Agreement *given, int64_t place) {
     }
 }
 
-/* Takes rows until none is left that nobody has taken */
+/* Takes rows, of those that no thread has taken, until none is left */
 void THIS(consensus)(const Agreement *given) {
     for (;;) {
         int64_t place = __atomic_fetch_add(given->next, 1, __ATOMIC_RELAXED);

@@ -1,4 +1,4 @@
-/* What Python hands to the search for poses. */
+/* The structure that Python passes to the search for poses among outliers. */
 #ifndef CAMTORCH_CONSENSUS_H
 #define CAMTORCH_CONSENSUS_H
 
@@ -13,7 +13,7 @@ typedef struct {
     const int64_t *rows;             /* those that go on */
     int64_t row_count, count, samples;
     double most;   /* the threshold's square */
-    int64_t *next; /* the row that whoever is free takes */
+    int64_t *next; /* the next row that a free thread takes */
 } Agreement;
 
 #ifdef VARIANT

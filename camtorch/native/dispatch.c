@@ -21,7 +21,7 @@
 #define IF_AVX2(...)
 #endif
 
-/* What it is, its name, and what it is given */
+/* The result, the name and the argument of each entry */
 #define EACH_ENTRY(ENTRY)                                                                                              \
     ENTRY(int32_t, sample, Job *)                                                                                      \
     ENTRY(void, sample_images, const Images *)                                                                         \
@@ -68,7 +68,7 @@ static int variant(void) {
     return now;
 }
 
-/* Uses the variant of that name from now on; 0 if this CPU cannot run it, or the library has none */
+/* Chooses the variant of that name for all calls; 0 if this CPU cannot run it, or the library has none */
 EXPORTED int32_t camtorch_use(const char *name) {
     for (int i = best(); i >= 0; i--)
         if (NAMES[i] && !strcmp(NAMES[i], name)) {
@@ -166,7 +166,7 @@ static int are_radians(const Turned *given) {
     return all;
 }
 
-/* Whether the first three vectors are the columns of a rotation, as far as they are taken for one */
+/* Whether the first three vectors are the columns of a rotation, up to a rounding of 1e-3 */
 static int is_rotation(const Turned *given) {
     double m[3][3], off = 0;
     for (int i = 0; i < 3; i++)
@@ -184,7 +184,7 @@ static int is_rotation(const Turned *given) {
 }
 
 /* A lattice, the images that are sampled on it, and other pixels of the same cameras, in one call on this thread: in between
- * caches stay warm. Flags of what is left, as of lattices, and then nothing is made; or as of moves, LEFT_BITS higher */
+ * caches stay warm. Flags of `lattices`, and then nothing is made; or those of `moves`, LEFT_BITS higher */
 EXPORTED int64_t camtorch_together(const Together *given) {
     const Lattices *lattices = &given->lattices;
     int64_t left = 0;

@@ -91,7 +91,7 @@ static int64_t outline(const Draws *d, int64_t c, const double *f, const void *i
     return 2 * RIM;
 }
 
-/* What is to be known of a new lens, or its limits alone */
+/* Finds the domain of a new lens, or its limits on azimuths alone */
 static void ask(const Draws *d, Cameras *lens, const double *parameters, int limits) {
     Domain asked = d->domain;
     if (!lens->safe_radius_sq) return; /* it has no stages */
@@ -137,7 +137,7 @@ static int64_t bend(Draws *d, int64_t c, const double *f, Cameras *found) {
             ask(d, &lens, parameters, 0);
             lens.limits2 = lens.extent = NULL;
         }
-        if (i == TRIES) break; /* as it was */
+        if (i == TRIES) break; /* no step fits: it keeps its coefficients */
         if (evaluate(&lens, UNPROJECT, n, rim, rays, valid)) {
             if (d->tries || !made.limits2) return LEFT_LENS;
             lens.limits2 = made.limits2, lens.extent = made.extent;
@@ -239,7 +239,7 @@ static int64_t fill(const Draws *d, int64_t c, const Cameras *lens) {
     return 0;
 }
 
-/* The same, with what it needs to know of a lens and of the source that is known already, or is found for a new lens */
+/* The same; finds the limits of a new lens if they are needed. Flags of what is left */
 static int64_t fill_knowing(Draws *d, int64_t c, Cameras *lens) {
     int64_t left = fill(d, c, lens);
     if (left & LEFT_FROM && d->places && d->sensitivity && d->made.limits2) {
@@ -254,7 +254,7 @@ static int64_t fill_knowing(Draws *d, int64_t c, Cameras *lens) {
     return (left & LEFT_FROM ? d->sensitivity ? LEFT_LENS : LEFT_BASE : 0) | (left & LEFT_TO ? LEFT_SOURCE : 0);
 }
 
-/* Where what is made lies */
+/* Divides `room` among the results */
 static void divide(Draws *d) {
     const int64_t rows = d->cameras;
     char *at = d->room;

@@ -1,4 +1,4 @@
-/* What Python hands to the making of drawn cameras. */
+/* The structure that Python passes to `draws`, which makes cameras of drawn values. */
 #ifndef CAMTORCH_DRAWS_H
 #define CAMTORCH_DRAWS_H
 

@@ -19,7 +19,7 @@
 #define JOINED(a, b) JOINED_(a, b)
 #define THIS(name) JOINED(name, VARIANT)
 
-enum { LANES = 16 };      /* that a block is filled up to a multiple of */
+enum { LANES = 16 };      /* a block is filled up to a multiple of it */
 enum { MOST_STEPS = 5 };  /* of Newton's method; what then still moves is left to brackets and searches */
 enum { START_ROUNDS = 6, DAMPED_STEPS = 60 }; /* of a search */
 enum { SQUARE = 64, PROBES = 5 }; /* pixels of a cell of a lattice; of these, where one in doubt is looked at */
@@ -70,10 +70,10 @@ static int numbers_of(const Part *part) {
     return part->factor == NO_FACTOR ? count : count + part->n + (part->factor == RATIONAL ? part->m : 0);
 }
 
-/* What a number was that several callers add to */
+/* Adds to a number that threads share, and returns what it was */
 static int64_t added(int64_t *number, int64_t count) { return __atomic_fetch_add(number, count, __ATOMIC_RELAXED); }
 
-/* The tile that whoever is free takes */
+/* The next tile for a free thread */
 static int64_t taken(int64_t *next, int64_t *own) { return next ? added(next, 1) : (*own)++; }
 
 #define R float
@@ -109,7 +109,7 @@ static int64_t taken(int64_t *next, int64_t *own) { return next ? added(next, 1)
 #include "geometry_moves.h"
 #include "geometry_domain.h"
 
-/* Makes tiles until none is left that nobody has taken; how many points wait for `limits2` */
+/* Takes tiles, of those that no thread has taken, until none is left; how many points wait for `limits2` */
 int64_t THIS(geometry)(const Rows *rows) {
     return rows->cameras->is_double ? rows_double(rows) : rows_float(rows);
 }

@@ -1,4 +1,4 @@
-/* What Python hands to the geometry: codes of what optics are made of, numbers, rows.
+/* What Python passes to the geometry: codes of what optics are made of, numbers, rows.
  *
  * The formulas are those of camtorch/optics, named alike there, and their sources stand there.
  */
@@ -122,7 +122,7 @@ typedef struct {
     double *sums;
     int64_t count, tile; /* points of a camera; of a tile */
     int64_t direction;
-    int64_t *next; /* the tile that whoever is free takes; NULL: one caller takes all */
+    int64_t *next; /* the next tile that a free thread takes; NULL: one thread takes all */
 } Rows;
 
 /* What is made of pixels that are moved: positions as of grid_sample, OUTSIDE where there is none; or pixels, -1 there, of
@@ -133,7 +133,7 @@ enum { EDGE_POINTS = 64 }; /* along a side of a box; warp/boxes.py */
    exact positions; or some box takes more than its outline, some pose has no rotation */
 enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4, LEFT_LABELS = 4 };
 #define OUTSIDE (-9)
-#define FAR 100 /* beyond, positions are drawn in */
+#define FAR 100 /* positions beyond are clamped to it */
 
 /* Pixels of cameras `from`, by rays that are turned, to those of `to`; each as many as `cameras`, or one for all. All
    numbers are of the type of both */
@@ -149,7 +149,7 @@ typedef struct {
     int64_t result_strides[3];
     uint8_t *valid;      /* (c, n) without gaps */
     int64_t count, tile; /* pixels of a camera; of a tile */
-    int64_t *next;       /* the tile, or of lattices the camera, that whoever is free takes */
+    int64_t *next;       /* the next tile, or camera of lattices, that a free thread takes */
 } Move;
 
 /* Lattices (c): `move` is of their nodes and of the pixels at the rim, in planes, and `cells` what is asked of them; both
@@ -159,16 +159,16 @@ typedef struct {
     Classification cells;
     int64_t first_row; /* of the target, where cells begin */
     int64_t learns; /* CELL_QUINTIC stays in `cells`, without a place in `exact`, where few cells may have one */
-    float *narrow;     /* (c, 2, nodes), the nodes in float, or NULL: they are */
+    float *narrow;     /* (c, 2, nodes), the nodes in float; NULL if they are so already */
     /* (2, c rows columns, 8, 8): positions of all pixels of the cells that `classify` leaves, NaN where there is none,
        and of those around a cell in which what is mapped ends. Each cell gets the number of its place there */
     void *exact;
-    int64_t *used; /* how many places there are */
+    int64_t *used; /* how many places of `exact` are used */
     const Job *jobs; /* images (c) that are sampled, each as soon as its lattice is there; none where `exact` is double */
     int64_t job_count;
 } Lattices;
 
-enum { SQUARES = STEP * STEP }; /* positions of a cell */
+enum { SQUARES = STEP * STEP }; /* positions in a cell */
 enum { LEFT_BITS = 3 };
 
 /* What turns: vectors, NaN where one is not finite, of which the first three of a POSE are the columns of a rotation; or
@@ -184,7 +184,8 @@ typedef struct {
     int64_t count, is_double, form;
 } Turned;
 
-/* One sample: a lattice of one camera, images that are sampled on it, in parts or whole, pixels that move, and vectors */
+/* A sample: a lattice of one camera, images that are sampled on it, whole or by other calls, pixels that move, and
+   vectors; or the pixels of a batch */
 typedef struct {
     const Job *jobs;
     int64_t job_count, is_whole; /* 0: others sample the images */

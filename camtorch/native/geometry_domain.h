@@ -10,7 +10,7 @@ enum { STEPS = 129 };         /* radii on which the image of a radial stage is l
 typedef struct {
     const Domain *of;
     const Part *part;   /* the first stage */
-    const double *numbers; /* its own */
+    const double *numbers; /* of the first stage */
     const double *constants;
 } Lens;
 
@@ -88,7 +88,7 @@ static double first_root(int degree, const double *c, double end) {
 static double closed_fold(const Part *part, const double *k, double end) {
     double c[MOST_DEGREE + 1] = {1};
     const int n = part->n;
-    if (n + part->m > MOST_DEGREE || part->factor == RADIUS_TABLE) return end; /* whoever calls gives the fold of those */
+    if (n + part->m > MOST_DEGREE || part->factor == RADIUS_TABLE) return end; /* the caller finds those in `folds` */
     switch (part->factor) {
     case POLYNOMIAL:
     case RADIUS_POLYNOMIAL:

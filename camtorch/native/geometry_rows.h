@@ -609,7 +609,7 @@ static void T(solutions)(const T(Camera) *c, int n, R *restrict u, R *restrict v
     T(rays)(c, n, u, v, ok, x, y, z);
 }
 
-/* How many wait for an extent */
+/* Pixels of a row to rays; how many wait for an extent */
 static int T(unproject)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count) {
     const int n = (count + LANES - 1) & -LANES;
     const int64_t *from = rows->row_strides, *to = rows->result_strides;

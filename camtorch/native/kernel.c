@@ -154,7 +154,7 @@ INLINE void taps_of(float x, int64_t side, int mode, int padding, int64_t *at, f
     }
 }
 
-/* Those of both axes */
+/* The taps of both axes */
 typedef struct {
     int64_t columns[MOST_TAPS], rows[MOST_TAPS];
     float across[MOST_TAPS], down[MOST_TAPS];
@@ -353,7 +353,7 @@ INLINE int inside(const Job *job, V8 u, V8 v, float before, float beyond) {
     return all8((u >= low) & (u <= right) & (v >= low) & (v <= below));
 }
 
-/* None begins in the last `beyond` columns, nor in the last row */
+/* Whether no square begins in the last `beyond` columns or in the last row */
 INLINE Squares squares_of(const Job *job, V8 u, V8 v, int32_t beyond) {
     Squares at;
     at.x = least8(whole8(u), every8i((int32_t)job->source_width - 1 - beyond));
@@ -1690,7 +1690,7 @@ void THIS(sample_images)(const Images *given) {
     }
 }
 
-/* Makes tiles until none is left that nobody has taken; how many it made */
+/* Takes tiles, of those that no thread has taken, until none is left; how many it made */
 int32_t THIS(sample)(Job *job) {
     const int64_t tiles = (job->height + job->tile_rows - 1) / job->tile_rows;
     const Rows make = way_of(job);

@@ -556,7 +556,7 @@ static double by_three(const Poses *given, Row *row, double *rotation, double *t
     int complete;
     for (int64_t i = 0, seen = 0; i < row->count; i++)
         if (row->weights[i] > 0) places[seen++] = 3 * i;
-    cost *= 1 - 1e-6; /* less is rounding */
+    cost *= 1 - 1e-6; /* a smaller difference is rounding */
     for (int without = 0; without < 4; without++) {
         for (int k = 0; k < 3; k++) {
             const int64_t place = places[k + (k >= without)];
@@ -667,7 +667,7 @@ static void assess(const Poses *given, Row *row, int64_t at, double cost) {
     given->rms[at] = is_valid ? sqrt(residual / (sum > DBL_MIN ? sum : DBL_MIN)) : INFINITY, given->valid[at] = (uint8_t)is_valid;
 }
 
-/* Takes rows until none is left that nobody has taken */
+/* Takes rows, of those that no thread has taken, until none is left */
 void THIS(poses)(const Poses *given) {
     const int64_t n = given->count;
     const int64_t rows = 2 * n > 7 ? 2 * n : 7;

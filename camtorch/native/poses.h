@@ -1,4 +1,4 @@
-/* What Python hands to the search for poses. */
+/* The structures that Python passes to the search for poses. */
 #ifndef CAMTORCH_POSES_H
 #define CAMTORCH_POSES_H
 
@@ -41,7 +41,7 @@ typedef struct {
     double *vectors, *rms;
     uint8_t *inliers;
     double *covariance;
-    int64_t *next, *left; /* the row that whoever is free takes; how many points wait for what is known of lenses */
+    int64_t *next, *left; /* the next row that a free thread takes; how many points wait for limits of lenses */
 } Poses;
 
 /* Cameras (b) that see v views of n points each: residuals, and the linearised problem if it is asked for, whose columns are by
@@ -60,7 +60,7 @@ typedef struct {
     const int64_t *learnt; /* (columns): of intrinsics and parameters */
     int64_t columns;
     double *view, *shared; /* triangles (b, v, 6, 6 + columns + 1), (b, columns + 1, columns + 1), or NULL */
-    int64_t *left;         /* how many points wait for what is known of lenses; -1: no memory */
+    int64_t *left;         /* how many points wait for limits of lenses; -1: no memory */
 } Views;
 
 /* Damped steps of such problems, of views with so many unknowns; `System.step` there */

@@ -1,4 +1,4 @@
-/* What Python hands to the sampler: plain pointers and sizes. headers.py makes the same structures in structs.py of these. */
+/* The structures that Python passes to the sampler, plain pointers and sizes; headers.py writes them to structs.py. */
 #ifndef CAMTORCH_SAMPLER_H
 #define CAMTORCH_SAMPLER_H
 
@@ -44,7 +44,7 @@ typedef struct {
     int64_t exact_stride;
     int32_t type, mode, padding;
     int32_t tile_rows;
-    int64_t next; /* the tile that whoever is free takes */
+    int64_t next; /* the next tile that a free thread takes */
 } Job;
 
 /* Images of one size, of which each shows the same positions of a lattice */
@@ -82,7 +82,7 @@ typedef struct {
     uint8_t *mapped; /* (b, y, x): whether there is a position; not of gradients */
     int64_t count, rows, columns, height, width;
     int64_t is_transposed; /* nodes are then zeros at first */
-    int64_t next;          /* the strip, or if it is transposed the camera, that whoever is free takes */
+    int64_t next;          /* the next strip, or if it is transposed camera, that a free thread takes */
 } Laying;
 
 #endif

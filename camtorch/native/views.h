@@ -17,7 +17,7 @@ typedef struct {
     double *residuals, *weights;   /* (n, 2), (n): what `look` makes of them */
     uint8_t *valid;                /* (n) */
     double *moved, *slopes, *sums; /* for a while: (n, 3), (n, 3), (n, 4 + the camera's parameters) */
-    int64_t left;                  /* how many points wait for what is known of lenses */
+    int64_t left;                  /* how many points wait for limits of lenses */
 } View;
 
 /* In eight sums, which a compiler can have in registers side by side */

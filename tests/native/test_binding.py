@@ -64,7 +64,7 @@ def test_each_call_has_a_known_answer():
     assert sorted(asked) == sorted(name for name, (_, given) in calls if given not in ([], ["char*"]))
 
 
-FIELD = "    int64_t next; /* the tile that whoever is free takes */\n"
+FIELD = "    int64_t next; /* the next tile that a free thread takes */\n"
 
 
 @compiles
