@@ -56,8 +56,7 @@ def call_for(
 ) -> SampleCall | None:
     """Return the call of native code that moves all that samples of a form hold; a thread keeps the last ones.
 
-    None if no lattice serves, images shrink or have unusual strides, or threads would idle: each takes whole samples of
-    a batch.
+    None if no lattice serves, images shrink or have unusual strides, or threads would idle: each takes whole samples.
 
     Args:
         sizes: of both images.
