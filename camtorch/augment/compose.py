@@ -118,7 +118,7 @@ class Compose(Augmentation):
 
     @property
     def crops(self) -> Mapping[str, int]:  # type: ignore[override]
-        """See `Augmentation`; those of all parts."""
+        """The boxes that draws of all parts need; see `Augmentation`."""
         return _by_place(part.crops for part in self.parts)
 
     @property
@@ -138,7 +138,7 @@ class Compose(Augmentation):
 
     @property
     def makes_pinholes(self) -> bool:  # type: ignore[override]
-        """See `SampleTransform`; whether all parts do, from the last crop of a box on."""
+        """Whether all parts from the last `BoxCrop` of p=1 on make pinhole cameras; see `SampleTransform`."""
         last = max((i for i, part in enumerate(self.parts) if part.crops and part.p == 1), default=0)
         return all(part.makes_pinholes for part in self.parts[last:])
 

@@ -211,10 +211,10 @@ class Mirroring:
 
     def exchange(self, moved: dict[str, Any], named: Named, mirrored: Tensor | None, batched: bool, owner: str) -> None:
         """Let landmarks and fields of a moved sample change places where they are seen in a mirror, (B,) bool."""
-        sides = self.sides(named)  # that none lacks the other, whatever was drawn
+        sides = self.sides(named)  # raises if a side lacks the other one, whether or not this draw mirrors
         others = (name for name in moved if name.rpartition("/")[2] in self.by_name and name not in named)
         kept = {name: (None, moved[name]) for name in others}
-        for name, (_, value) in kept.items():  # what says something of each landmark, and does not move itself
+        for name, (_, value) in kept.items():  # values of each landmark that do not move, such as visibilities
             several = isinstance(value, (list, tuple)) and all(isinstance(v, (Tensor, np.ndarray)) for v in value)
             if not several and not isinstance(value, (Tensor, np.ndarray)):
                 raise TypeError(

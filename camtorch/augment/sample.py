@@ -353,7 +353,7 @@ class SampleTransform(KeepsCamera, nn.Module):
     def _seen(self, key: str, given: Any, plan: Plan, change: Change) -> Tensor | None:
         """Return a mask of validity with a dim B, from the one that was given; None if neither is wanted."""
         seen = None
-        if getattr(given, "ndim", 0) > 1 + plan.batched:  # and no flag for each sample
+        if getattr(given, "ndim", 0) > 1 + plan.batched:  # a mask, not one flag for each sample
             seen = plan.rows(torch.as_tensor(given) != 0)
             if len(seen) != change.count:
                 raise ValueError(

@@ -61,11 +61,11 @@ class _Block:
 
 
 _held: dict[int, _Block] = {}
-"""By where they lie, the blocks on which this process has a tensor."""
+"""Blocks in which this process has a tensor, by their addresses."""
 _away: list[_Block] = []
-"""Those on which another one may have one."""
+"""Blocks in which another process may have a tensor."""
 _idle: list[_Block] = []
-_lock = threading.Lock()  # of the lists, but for what comes back: a tensor may die wherever Python collects garbage
+_lock = threading.Lock()  # of the lists; `back` goes without it: a tensor may die wherever Python collects garbage
 _forks = 0
 
 

@@ -17,7 +17,7 @@ _ALIGNED = 16  # bytes: where the numbers of any dtype may begin
 _MOST = 64  # tensors
 
 _known: dict[tuple[Any, ...], tuple[Tensor, Tensor]] = {}
-"""By its mark, which an edit in place changes, a tensor, so that its memory stays, and its values on the CPU."""
+"""Mark of a tensor, which edits in place change -> the tensor, so that its memory stays, and its values on the CPU."""
 
 
 def may_read(*tensors: Tensor) -> bool:

@@ -120,7 +120,7 @@ class Call:
 
 
 def _copied(images: Tensor, layout: torch.memory_format) -> Tensor:
-    source = images if images.stride(0) else images[:1]  # which all results show
+    source = images if images.stride(0) else images[:1]  # one image, which all results show
     return source.clone(memory_format=layout).expand(images.shape)
 
 

@@ -126,7 +126,7 @@ class Lenses:
     def asked(self) -> structs.Domain:
         """The request for the domain, with optics in double precision."""
         made, plan = structs.Domain(), self.plan
-        # they are in double precision if the model computes them
+        # parameters that the model computes are computed in double precision
         k = self.k if plan.places is not None else self.k.double()
         parameters = plan.parameters_of(self.optics_of, k) if plan.parameters else k
         made.parts, made.part_count = addressof(plan.parts), plan.count

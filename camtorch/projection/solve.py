@@ -54,7 +54,7 @@ def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Fo
     found = a, b, there & within
     if by_stages is None:
         return found
-    assert domain.stagewise is not None  # as above
+    assert domain.stagewise is not None  # as `by_stages` is not None
     stagewise = domain.stagewise[camera, 0]
     a, b = (torch.where(stagewise, *pair) for pair in zip(by_stages[:2], found[:2], strict=True))
     return a, b, (stagewise & by_stages[2]) | (~stagewise & found[2])  # ONNX Runtime cannot select bools

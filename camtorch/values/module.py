@@ -162,7 +162,7 @@ class GeometryModule(UnsharedState):
     def __getstate__(self) -> dict[str, Any]:
         # a tensor of a graph cannot be copied with its graph: the copy is a leaf
         state = self.__dict__.copy()
-        state.pop("_told", None)  # what a call leaves
+        state.pop("_told", None)  # whether a call of this module has warned
         state["_buffers"] = {
             name: b if b is None or b.is_leaf else b.detach().requires_grad_() for name, b in self._buffers.items()
         }

@@ -101,7 +101,7 @@ _started: list[tuple[threading.Thread, SimpleQueue[_Run | None]]] = []
 def _serve(worker: SimpleQueue[_Run | None]) -> None:
     for run in iter(worker.get, None):
         run()
-        del run  # which frees what it worked on
+        del run  # frees the tensors that it worked on, while the thread waits
 
 
 @atexit.register

@@ -109,7 +109,7 @@ def settle(
     if padding == "zeros":
         seen = torch.cat((positions, around[..., 2, 2, None]), -1)
         low, high = seen.aminmax(dim=-1)
-        reach = (high - low) / 2 + _FAR_OFF / half  # what lies between the places looked at
+        reach = (high - low) / 2 + _FAR_OFF / half  # the range of positions, with a margin for those between the probes
         is_off = (by_cubics.amax(-1) < 1) & ((high + reach < -1) | (low - reach > 1))
         is_cubic |= is_off.any(-1)
     # a quarter of that, and of what cubics miss: where the curvature steps, quintics gain nothing, and swing

@@ -227,7 +227,7 @@ def _render(images: Tensor, grid: Tensor, where: Sampling, levels: Pyramid, how:
     if any(fill) or padding_mode != "zeros" or minifies:
         value = float(fill[0]) if len(fill) == 1 else result.new_tensor(fill)[:, None, None]
         if padding_mode == "zeros":
-            # what part of a sample comes from the image, and not from the zeros around it
+            # `covered`: the part of a sample that comes from the image, not from the zeros around it
             ones = images.new_ones(1, 1, *images.shape[-2:]).expand(grid.shape[0], -1, -1, -1)
             covered = sample(ones, grid, mode, "zeros")
             result = torch.where(covered != 0, result * covered, 0) if minifies else result
