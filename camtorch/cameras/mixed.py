@@ -6,7 +6,7 @@ import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate, product
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
+from typing import Any, NamedTuple, NoReturn, cast
 
 import torch
 from torch import Tensor, nn
@@ -20,11 +20,9 @@ from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import in_worker
 from camtorch.projection.evaluation import kept_cameras, per_row
 from camtorch.projection.evaluation import rows_of as camera_rows
+from camtorch.projection.rows import CameraRows, Direction
 from camtorch.values.arguments import Numbers, as_image_size, as_points, no_camera, shown, working_dtype
 from camtorch.values.module import refused_index, remade
-
-if TYPE_CHECKING:
-    from camtorch.projection.rows import CameraRows, Direction
 
 
 class _Group(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,10 +15,8 @@ from camtorch.evaluate.recorded import CLASSES
 from camtorch.evaluate.tensors import are_known, may_look_at
 from camtorch.native.structs import NODES
 from camtorch.optics.charts import even_steps_and_ratios
+from camtorch.optics.radial import RadialFactor
 from camtorch.values.arguments import columns
-
-if TYPE_CHECKING:
-    from camtorch.optics.radial import RadialFactor
 
 RADII = 1024  # at which a factor is followed to its fold
 _PARTS = 256  # of the interval with a fold, divided twice before the secant

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import is_unknown, known_false
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotate_planes, rotation_matrix
@@ -23,9 +24,6 @@ from camtorch.values.arguments import (
     check_devices,
     working_dtype,
 )
-
-if TYPE_CHECKING:
-    from camtorch.evaluate.kept import Kept
 
 _MOST_KEPT = 1 << 19  # rays, 6 MB in float32, at most, that each camera of a large data set keeps
 _STRAIGHT = 1e-24  # the squared sine of the angle to the vertical up to which a ray counts as vertical

@@ -5,21 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from camtorch.optics.derivatives import jacobian_of
+from camtorch.optics.model_spec import Optics
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import broadcast_shapes, columns
 from camtorch.values.module import remade
 
-if TYPE_CHECKING:
-    from camtorch.optics.model_spec import Optics
-
-    CameraT = TypeVar("CameraT", bound=CameraLike)
+CameraT = TypeVar("CameraT", bound=CameraLike)
 
 AXES = ("horizontal", "vertical", "diagonal")  # of an image, along which a field of view is measured
 
