@@ -343,7 +343,7 @@ class Camera(Freezable, Editable):
         return self.project(points)
 
     if TYPE_CHECKING:
-        __call__ = forward
+        __call__ = forward  # nn.Module's has no types
 
     def project(self, points: Numbers) -> tuple[Tensor, Tensor]:
         """Project points, or rays, of the camera frame to pixels.

@@ -133,7 +133,7 @@ class CanonicalCamera(SampleTransform):
         return self._resize_sample(sample, batch, change.inverse())
 
     if TYPE_CHECKING:
-        __call__ = forward
+        __call__ = forward  # nn.Module's has no types
 
     def _scale_sample(self, sample: Sample, batch: Batch, scale: Tensor) -> Sample:
         """Return the sample with every length of the camera's frame multiplied by `scale` (B,)."""

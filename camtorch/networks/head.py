@@ -143,7 +143,7 @@ class CameraHead(GeometryModule):
             return self.camera(self.linear(features.to(self.linear.weight.dtype)))
 
     if TYPE_CHECKING:
-        __call__ = forward
+        __call__ = forward  # nn.Module's has no types
 
     def camera(self, numbers: Tensor) -> Camera:
         """Return cameras (*B) for numbers (*B, n) in the order of `names`, for use with your own layer.

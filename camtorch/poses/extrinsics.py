@@ -92,7 +92,7 @@ class Extrinsics(BatchedModule):
         return restore(turned + translation.mT.unsqueeze(-1))
 
     if TYPE_CHECKING:
-        __call__ = forward
+        __call__ = forward  # nn.Module's has no types
 
     def matrix(self) -> Tensor:
         """Return the matrices (*B, 4, 4) [[R, t], [0, 1]]."""

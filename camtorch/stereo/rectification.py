@@ -115,7 +115,7 @@ class Rectification(GeometryModule):
         return to_left(left), to_right(right)
 
     if TYPE_CHECKING:
-        __call__ = forward
+        __call__ = forward  # nn.Module's has no types
 
     def disparity_to_points(self, disparity: Numbers, valid: Numbers | None = None) -> tuple[Tensor, Tensor]:
         """Return the points of the scene for disparities, in the frame of the rectified left camera.

@@ -85,7 +85,7 @@ class Views(GeometryModule):
         return np.stack(views, int(images.ndim == 4)) if isinstance(images, np.ndarray) else views
 
     if TYPE_CHECKING:
-        __call__ = forward
+        __call__ = forward  # nn.Module's has no types
 
     def valid_masks(self) -> Tensor:
         """Return (1, N, 1, S, S) bool: whether the camera sees each pixel of the views."""

@@ -170,7 +170,7 @@ class Warp(CameraPair):
         return self.warped(images.flatten(1, -3), sampler._replace(fill=each)).unflatten(1, images.shape[1:-2])
 
     if TYPE_CHECKING:
-        __call__ = forward
+        __call__ = forward  # nn.Module's has no types
 
     def strips(
         self,
