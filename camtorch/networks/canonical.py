@@ -55,9 +55,6 @@ class CanonicalCamera(SampleTransform):
         ValueError: If the focal length is not positive, `scales` is another word, or a size is given with "depth".
     """
 
-    focal: float
-    image_size: tuple[int, int] | None
-
     def __init__(
         self,
         focal: float,

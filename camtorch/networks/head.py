@@ -65,13 +65,6 @@ class CameraHead(GeometryModule):
         (torch.Size([8]), 85)
     """
 
-    model: type[Camera]
-    image_size: tuple[int, int]
-    centre: float
-    shared_focal: bool
-    names: tuple[str, ...]
-    linear: nn.Linear
-
     def __init__(
         self,
         features: int,
@@ -108,7 +101,7 @@ class CameraHead(GeometryModule):
         # numbers without effect, like the angles of a table, cannot be learnt
         self._coefficients = [i for i, moves in enumerate((scales > 0).all(0).tolist()) if moves and free[4 + i]]
         self._centres = [i for i in range(2) if free[2 + i] and centre > 0]
-        self.names = (
+        self.names: tuple[str, ...] = (
             "focal",
             *(() if shared_focal else ("aspect",)),
             *(("cx", "cy")[i] for i in self._centres),

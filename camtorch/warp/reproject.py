@@ -50,13 +50,6 @@ class Reproject(GeometryModule):
         TypeError: If a camera is no Camera, or extrinsics are no Extrinsics.
     """
 
-    source: Camera
-    target: Camera
-    batch_shape: torch.Size
-    mode: Mode
-    padding_mode: PaddingMode
-    fill: tuple[float, ...]
-
     def __init__(
         self,
         source: Camera,

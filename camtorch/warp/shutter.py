@@ -66,8 +66,6 @@ class RollingShutter(GeometryModule):
 
     readout: Tensor
     rates: Tensor
-    direction: Direction
-    batch_shape: torch.Size
 
     def __init__(self, readout: Numbers, rates: Numbers, *, direction: Direction = "down"):
         super().__init__()

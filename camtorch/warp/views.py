@@ -54,12 +54,6 @@ class Views(GeometryModule):
     """
 
     rotations: Tensor
-    camera: Camera
-    view: Pinhole
-    names: tuple[str, ...]
-    mode: Mode
-    warps: nn.ModuleList
-    backs: nn.ModuleList
 
     def __init__(
         self, camera: Camera, view: Pinhole, rotations: Tensor, names: tuple[str, ...], mode: Mode = "bilinear"
