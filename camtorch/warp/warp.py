@@ -83,11 +83,6 @@ class Warp(CameraPair):
     """
 
     _decides = False  # True: the warp itself chooses which images to antialias
-    batch_shape: torch.Size
-    mode: Mode
-    padding_mode: PaddingMode
-    fill: tuple[float, ...]
-    antialias: bool
     _has_shutters: ClassVar[bool] = False
 
     def __init__(
