@@ -28,7 +28,7 @@ from camtorch.warp.warp import Warp
 
 _HALF = 5e-3  # absolute: rotations that were half precision on the way are the same ones
 _ROUNDED = 1e-5  # relative: cameras that were float32 on the way are the same ones
-Moved = TypeVar("Moved", Tensor, tuple[Tensor, Tensor])
+TensorOrPair = TypeVar("TensorOrPair", Tensor, tuple[Tensor, Tensor])
 
 
 def _same(value: Tensor) -> Tensor:
@@ -369,14 +369,14 @@ class Change:
         return self._inverse
 
     def each(
-        self, value: Tensor, move: Callable[[Part, Tensor], Moved], stay: Callable[[Camera, Tensor], Any] = as_is
-    ) -> Moved:
+        self, value: Tensor, move: Callable[[Part, Tensor], TensorOrPair], stay: Callable[[Camera, Tensor], Any] = as_is
+    ) -> TensorOrPair:
         """Return `move(part, rows)` of every part's rows of `value`, and `stay(camera, rows)` if nothing moves.
 
         Both give a tensor, or a pair of tensors.
         """
 
-        def of(part: Part) -> Moved:
+        def of(part: Part) -> TensorOrPair:
             # results share no memory with values that the caller passed
             rows = value[part.rows] if part.rows is not None else value.clone() if part.moves is None else value
             return stay(part.camera, rows) if part.moves is None else move(part, rows)
@@ -558,7 +558,7 @@ def gated(gate: Tensor, moved: Tensor, kept: Tensor) -> Tensor:
     return torch.where(gate.to(moved.device).reshape(-1, *[1] * (moved.ndim - 1)), moved, kept.to(moved.dtype))
 
 
-def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: Moved) -> Moved:
+def _both(function: Callable[[tuple[Tensor, ...]], Tensor], *results: TensorOrPair) -> TensorOrPair:
     """Apply a function to the results, or to the first and to the second ones if they are pairs."""
     if isinstance(results[0], tuple):
         first, second = (function(pieces) for pieces in zip(*results, strict=True))

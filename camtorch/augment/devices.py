@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Change, Moved, Part, as_is
+from camtorch.augment.change import Change, Part, TensorOrPair, as_is
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.devices import may_read, on_cpu, remember, sent
@@ -62,8 +62,8 @@ class Elsewhere(Change):
         self._wide: Change | None = None
 
     def each(
-        self, value: Tensor, move: Callable[[Part, Tensor], Moved], stay: Callable[[Camera, Tensor], Any] = as_is
-    ) -> Moved:
+        self, value: Tensor, move: Callable[[Part, Tensor], TensorOrPair], stay: Callable[[Camera, Tensor], Any] = as_is
+    ) -> TensorOrPair:
         own = self.parts[0].camera.intrinsics.dtype
         dtype = torch.promote_types(value.dtype, own) if value.dtype.is_floating_point else own
         if dtype == own:

@@ -19,13 +19,13 @@ from camtorch.values.threads import thread_count
 from camtorch.warp.samples import Label, call_for
 from camtorch.warp.sampling import Options, Sampler
 
-Moved = tuple[Tensor, Tensor | None]
+MovedField = tuple[Tensor, Tensor | None]
 """A field of a sample as it comes out, and which of it is valid, if it has validity."""
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
 
 
 @dataclass(frozen=True)
-class Plan:
+class SamplePlan:
     """How samples of one form move. It is made once, and kept as long as the form and the transform stay the same."""
 
     fields: Mapping[str, str]  # name -> kind of what moves, in the order of the sample
@@ -39,7 +39,7 @@ class Plan:
         """Return a value with a dim B; a list has one already."""
         return value if self.batched or isinstance(value, list) else value.unsqueeze(0)
 
-    def together(self, change: Change, values: Mapping[str, Any]) -> dict[str, Moved]:
+    def together(self, change: Change, values: Mapping[str, Any]) -> dict[str, MovedField]:
         """Move by one call of C: images, pixels, and for a single sample boxes and rays.
 
         The other fields, and all of them if no call serves, are not in the result.
@@ -66,7 +66,7 @@ class Plan:
             names, call = known[2]
         if call is None or (moved := call(source, target, rotation, [*map(values.__getitem__, names)])) is None:
             return {}
-        results: dict[str, Moved] = {}
+        results: dict[str, MovedField] = {}
         for name, result in zip(names, moved, strict=True):
             if result is not None:
                 (rows, valid), dtype = result, values[name].dtype
@@ -104,7 +104,7 @@ class Plan:
 class Batch(NamedTuple):
     """Samples as they move: their plan, the values of its fields, and their cameras."""
 
-    plan: Plan
+    plan: SamplePlan
     values: Mapping[str, Any]  # as they came, where these are tensors; without a dim B if the plan is not `batched`
     camera: Camera
     checked: bool  # whether values need no check any more, or may be bad; those of a known form are not checked yet
@@ -114,7 +114,7 @@ class Batch(NamedTuple):
         return {name: (kind, self.plan.rows(self.values[name])) for name, kind in self.plan.fields.items()}
 
 
-def move(change: Change, kind: str, value: Tensor, options: Mapping[str, float]) -> Moved:
+def move(change: Change, kind: str, value: Tensor, options: Mapping[str, float]) -> MovedField:
     """Return values (B, ...) of a kind moved by a change; those of one sample may have more dims, of frames."""
     if lead := value.shape[1 : value.ndim - KINDS[kind].most_dims]:
         frames = Change(math.prod(lead), [replace(part, rows=None) for part in change.parts])

@@ -18,7 +18,7 @@ from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS, Named, is_b
 from camtorch.augment.keywords import check_arguments
 from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess, camera_of, check_agrees, check_targets, refuse
-from camtorch.augment.plan import Batch, Plan, move
+from camtorch.augment.plan import Batch, SamplePlan, move
 from camtorch.augment.reading import check_cameras, check_fields, check_one_size, form_of, moving
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
@@ -263,7 +263,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         flags = dict.fromkeys(["image_valid", *(f"{name}_valid" for name, kind in kinds.items() if kind in IMAGES)])
         masks = [key for key in flags if sample.get(key) is not None or (self.valid_mask and key == "image_valid")]
         calls = Kept() if are_free(*tensors.values()) else None
-        plan = Plan(kinds, batched, count, masks, self.mask_fill, calls)
+        plan = SamplePlan(kinds, batched, count, masks, self.mask_fill, calls)
         return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, True)
 
     def _check_matrices(self, batch: Batch, sample: Sample) -> None:
@@ -350,7 +350,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             moved["camera"] = list(target) if isinstance(sample.get("camera"), (list, tuple)) else target
         return moved
 
-    def _seen(self, key: str, given: Any, plan: Plan, change: Change) -> Tensor | None:
+    def _seen(self, key: str, given: Any, plan: SamplePlan, change: Change) -> Tensor | None:
         """Return a mask of validity with a dim B, from the one that was given; None if neither is wanted."""
         seen = None
         if getattr(given, "ndim", 0) > 1 + plan.batched:  # a mask, not one flag for each sample

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from camtorch.projection.domain import Domain
 
 
-class Plan:
+class ModelPlan:
     """The properties that all cameras of a model and a number of coefficients have in common."""
 
     def __init__(self, chart: Chart, lens: Lens, parts: Sequence[structs.Part], coefficients: Sequence[Tensor]):
@@ -88,7 +88,9 @@ class Lenses:
     struct: structs.Cameras
     """The lenses' part of the struct; pointers that are not set are of values that are not known yet."""
 
-    def __init__(self, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool = False):
+    def __init__(
+        self, plan: ModelPlan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool = False
+    ):
         self.plan, self.optics_of, self.k = plan, optics_of, k
         self.slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
         self.struct = struct = structs.Cameras()
@@ -110,7 +112,7 @@ class Lenses:
             self._add_domain(tables)
 
     @classmethod
-    def known(cls, plan: Plan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], made: Native) -> Lenses:
+    def known(cls, plan: ModelPlan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], made: Native) -> Lenses:
         """Return the lenses of cameras that native code made, with their parameters and domains."""
         lenses = cls.__new__(cls)
         lenses.plan, lenses.optics_of, lenses.k = plan, optics_of, k
@@ -235,7 +237,7 @@ _LONGEST = 512  # the most coefficients of lenses that are kept
 _lenses = Kept(24)
 
 
-def lenses_of(plan: Plan, k: Tensor, make: Callable[[], Lenses]) -> Lenses:
+def lenses_of(plan: ModelPlan, k: Tensor, make: Callable[[], Lenses]) -> Lenses:
     """Return the lenses of coefficients (C, n): one of the last ones used, or new ones."""
     if k.numel() > _LONGEST:
         return make()
@@ -295,11 +297,11 @@ def native_of(
     return Native(lenses_of(plan, k, lambda: Lenses(plan, optics_of, k, domain, tables)), intrinsics, usable)
 
 
-def _plan_of(optics_of: Optics, k: Tensor) -> Plan | None:
+def _plan_of(optics_of: Optics, k: Tensor) -> ModelPlan | None:
     given = [c.clone() for c in columns(k[:1].double())]
     chart, lens = optics_of(given)
     parts = codes(chart, lens)
-    return None if parts is None else Plan(chart, lens, parts, given)
+    return None if parts is None else ModelPlan(chart, lens, parts, given)
 
 
 def codes(chart: Chart, lens: Lens) -> list[structs.Part] | None:

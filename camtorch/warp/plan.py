@@ -68,7 +68,7 @@ def _part(held: str, name: str) -> Any:
     return property(part)
 
 
-class Plan:
+class WarpPlan:
     """The positions of a warp while its cameras stay, or once and for all, and calls that are ready for some images."""
 
     def __init__(self, pinned: Sampling | Lattice | None = None, padding: str = "zeros"):
@@ -146,7 +146,7 @@ class CameraPair(GeometryModule):
     @property
     def is_pinned(self) -> bool:
         """Whether positions stay whatever becomes of the cameras."""
-        plan: Plan | None = self._kept.result
+        plan: WarpPlan | None = self._kept.result
         return plan is not None and plan.is_pinned
 
     @property
@@ -242,7 +242,7 @@ class CameraPair(GeometryModule):
 
     def ready(self, images: object, mode: str | None, padding: str | None) -> Call | None:
         """Return the call that an earlier one has left for images of this form, if nothing has changed since."""
-        plan: Plan | None = self._kept.result
+        plan: WarpPlan | None = self._kept.result
         if plan is None or not plan.calls or not isinstance(images, Tensor):
             return None
         mode, padding = self.mode if mode is None else mode, self.padding_mode if padding is None else padding
@@ -273,7 +273,7 @@ class CameraPair(GeometryModule):
                 with torch.no_grad():
                     render(images, where, *sampler, kept, result[:, :, rows])
             return result
-        plan: Plan | None = self._kept.result
+        plan: WarpPlan | None = self._kept.result
         where = self.positions(route, sampler.padding_mode)
         call = prepared(images, where, sampler)
         if call is None:
@@ -309,9 +309,9 @@ class CameraPair(GeometryModule):
         with set_aside() if in_jit_trace() else nullcontext():  # a constant of the trace
             return self._plan().positions_for(reach if tolerance else "zeros", compute)
 
-    def _plan(self) -> Plan:
-        plan: Plan = self._kept.result
-        return plan if plan is not None and plan.is_pinned else self._kept(self.tensors, self.form, Plan)
+    def _plan(self) -> WarpPlan:
+        plan: WarpPlan = self._kept.result
+        return plan if plan is not None and plan.is_pinned else self._kept(self.tensors, self.form, WarpPlan)
 
     def by_pixel(self) -> Sampling:
         """Return the positions of all pixels, one by one."""

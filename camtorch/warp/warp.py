@@ -27,7 +27,7 @@ from camtorch.values.dtypes import check_averaged
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.grid import OUTSIDE
-from camtorch.warp.plan import CameraPair, Plan
+from camtorch.warp.plan import CameraPair, WarpPlan
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, Options, PaddingMode, Sampler, as_fill, as_options
 
 
@@ -230,7 +230,7 @@ class Warp(CameraPair):
             where = self.locate(range(self.target.size_for("Warp")[0]), self.padding_mode, 0.0)
         else:
             where = self.positions("kept") if is_exporting() else self.computed(self.padding_mode, self.tolerance)
-        self._kept.renew(lambda: Plan(where, self.padding_mode))
+        self._kept.renew(lambda: WarpPlan(where, self.padding_mode))
         return self
 
     def transform_points(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
