@@ -14,14 +14,14 @@ from camtorch.cameras.editing import edited
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.tensors import are_numbers, known_false, known_true
 from camtorch.poses.rotations import is_right, turn
-from camtorch.projection.evaluation import rows_of
+from camtorch.projection.evaluation import camera_rows
 from camtorch.projection.native_cameras import Native
 from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import remade
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
 from camtorch.warp.boxes import corners_of, in_order
 from camtorch.warp.panorama import seam_of
-from camtorch.warp.samples import between_of
+from camtorch.warp.samples import natives_of
 from camtorch.warp.sampling import Mode, Options
 from camtorch.warp.shifted import ShiftedWarp
 from camtorch.warp.warp import Warp
@@ -114,12 +114,12 @@ class Part:
         """(height, width) after the change."""
         return self.moves.image_size if isinstance(self.moves, LazyWarp) else self.target.size_for("Warp")
 
-    def between(self) -> tuple[Native, Native, Tensor | None] | None:
+    def natives(self) -> tuple[Native, Native, Tensor | None] | None:
         """Return both cameras and the rotation for native code; None if there is more, such as light."""
         if isinstance(self.moves, LazyWarp):
             start, end = self.moves.start, self.moves.native
             return None if start is None or end is None else (start, end, self.moves.rotation)
-        return None if self.moves is None or self.shades or self.light is not None else between_of(self.warp)
+        return None if self.moves is None or self.shades or self.light is not None else natives_of(self.warp)
 
     def with_warps(self, change: Callable[[Warp], Warp]) -> Part:
         """Return the part with each of its warps changed."""
@@ -145,13 +145,13 @@ class Part:
         def of(camera: Camera) -> Camera:
             return camera[index] if camera.batch_shape else camera  # a single one serves all rows
 
-        def rows_of(warp: Warp) -> Warp:
+        def taken(warp: Warp) -> Warp:
             rotation = warp.rotation if warp.rotation is None or warp.rotation.ndim == 2 else warp.rotation[index]
             return warp.rows_of(camera, of(warp.target), rotation, index)
 
         camera, light = of(self.camera), self.light
         light = light if light is None or len(light) == 1 else light[index]
-        return replace(self.with_warps(rows_of), rows=None, camera=camera, light=light)
+        return replace(self.with_warps(taken), rows=None, camera=camera, light=light)
 
     def then(self, second: Part) -> Part:
         """Return one part that does with one warp what this and another one of the same rows do in turn."""
@@ -193,7 +193,7 @@ def _single(camera: Camera) -> Native | None:
     """Return a single camera for native code; None if it cannot evaluate it."""
     if seam_of(camera) is not None or not are_numbers(*camera.tensors):
         return None
-    rows = rows_of(camera, *camera.tensors)
+    rows = camera_rows(camera, *camera.tensors)
     return rows.native if rows.usable is None else None
 
 

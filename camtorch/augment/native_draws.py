@@ -18,7 +18,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.native import structs
 from camtorch.native.library import loaded
 from camtorch.optics.radial_inverse import TABLE_WIDTH
-from camtorch.projection.evaluation import rows_of
+from camtorch.projection.evaluation import camera_rows
 from camtorch.projection.native_cameras import Lenses, Native, address, lenses_of
 from camtorch.projection.rows import CameraRows, domain_for, single_native
 from camtorch.rays.lattices import defined_or
@@ -49,7 +49,7 @@ class Start:
         source: the camera before. base: whose lens the new ones have, single or (B,). numbers: see `__init__`.
         """
         before, cameras = (
-            rows_of(camera, *[t.expand(*camera.batch_shape, t.shape[-1]) for t in camera.tensors])
+            camera_rows(camera, *[t.expand(*camera.batch_shape, t.shape[-1]) for t in camera.tensors])
             for camera in (source, base)
         )
         if before.native is None or cameras.native is None or before.usable is not None or cameras.usable is not None:

@@ -48,9 +48,9 @@ class SamplePlan:
         moves, calls = part.moves, self.calls
         if calls is None or moves is None or part.rows is not None or change.gate is not None or not self.count:
             return {}
-        if (between := part.between()) is None:
+        if (natives := part.natives()) is None:
             return {}
-        source, target, rotation = between
+        source, target, rotation = natives
         if max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != self.count:
             return {}
         options, sizes = moves.options, (part.camera.size_for("Warp"), part.image_size)

@@ -30,7 +30,7 @@ def as_vectors(values: Numbers, name: str, size: int, owner: str, device: torch.
     return vectors
 
 
-def rows_of(camera: Camera, batch: torch.Size) -> Camera:
+def as_double_rows(camera: Camera, batch: torch.Size) -> Camera:
     """Return the camera in float64 with its graph: `math.prod(batch)` rows, or no batch if it is one for all rows."""
     if not camera.batch_shape and all(t.dtype == torch.float64 for t in camera.tensors):
         return camera

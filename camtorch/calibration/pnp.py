@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch.calibration.batches import as_tensor, as_vectors, attached, learns, root_of, rows_of
+from camtorch.calibration.batches import as_double_rows, as_tensor, as_vectors, attached, learns, root_of
 from camtorch.calibration.bundle import CameraObservations, Poses, adjust_poses
 from camtorch.calibration.native_calls import Search, Solved, solve_poses
 from camtorch.calibration.ransac import LEAST, consensus
@@ -189,7 +189,7 @@ class _Given(NamedTuple):
 
         points = points.double().view(1, count, 3) if points.ndim == 2 else rows(points, count, 3)
         given = None if given is None else rows(given, count)
-        return cls(rows_of(camera, batch), points, rows(seen_at, count, 2), given, batch, dtype)
+        return cls(as_double_rows(camera, batch), points, rows(seen_at, count, 2), given, batch, dtype)
 
 
 def _solve_compiled(given: _Given, threshold: float | None) -> Solved | None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch.calibration.batches import as_tensor, attached, learns, root_of, rows_of
+from camtorch.calibration.batches import as_double_rows, as_tensor, attached, learns, root_of
 from camtorch.calibration.bundle import Bundle, CameraObservations, Free, Poses, State
 from camtorch.cameras.camera import Camera
 from camtorch.least_squares.levenberg_marquardt import minimise
@@ -86,7 +86,7 @@ def triangulate(
         )
     check_devices("triangulate", pixels=seen_at, **{f"extrinsics[{i}]": p.rotation for i, p in enumerate(poses)})
     dtype = working_dtype(seen_at, *(t for camera in given for t in camera.tensors), *(p.rotation for p in poses))
-    rows = [rows_of(camera, torch.Size()) for camera in given]
+    rows = [as_double_rows(camera, torch.Size()) for camera in given]
     matrices = torch.stack([pose.matrix().double() for pose in poses])
     at = seen_at.double().reshape(count, torch.Size(shape).numel(), 2)
     with torch.no_grad():

@@ -18,8 +18,7 @@ from camtorch.cameras.numbers import as_numbers_of
 from camtorch.evaluate.door import COLLATE_FUNCTIONS
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import in_worker
-from camtorch.projection.evaluation import kept_cameras, per_row
-from camtorch.projection.evaluation import rows_of as camera_rows
+from camtorch.projection.evaluation import camera_rows, kept_cameras, per_row
 from camtorch.projection.rows import CameraRows, Direction
 from camtorch.values.arguments import Numbers, as_image_size, as_points, no_camera, shown, working_dtype
 from camtorch.values.module import refused_index, remade

@@ -74,7 +74,7 @@ def _extrinsics(record: Record, names: list[str]) -> dict[str, Extrinsics]:
 
 
 def _pose(record: Record, undo: bool = False) -> Extrinsics:
-    return poses.from_matrices(record, poses.rows_of(record), undo)
+    return poses.from_matrices(record, poses.matrix_rows(record), undo)
 
 
 def render(rig: Rig, lossy: Lossy) -> str:

@@ -56,7 +56,7 @@ def parse(record: Record) -> Rig:
         if has_own:
             cameras[name] = _camera(record, frame)
         names[name] = None if has_own else "camera"
-        for row in poses.rows_of(frame["transform_matrix"]):
+        for row in poses.matrix_rows(frame["transform_matrix"]):
             found.extend(row)
     if not found:
         return Rig(cameras)

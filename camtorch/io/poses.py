@@ -66,7 +66,7 @@ def from_matrices(place: Place, rows: Any, undo: bool = False) -> Extrinsics:
     return pose(place, rotation_vector(rotations), translations, undo)
 
 
-def rows_of(record: Record) -> list[list[float]]:
+def matrix_rows(record: Record) -> list[list[float]]:
     """Return a 4 x 4 or 3 x 4 matrix of a pose as 4 x 4."""
     if len(record) not in (3, 4):
         record.fail(f"must have 3 rows; got {len(record)}")

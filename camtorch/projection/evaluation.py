@@ -68,10 +68,10 @@ def evaluate_rows(
     if way.is_constant and cameras_of is None and all(isinstance(side, int) for side in lead):
         with with_values(camera):
             intrinsics, distortion = (per_row(t, lead, rows) for t in camera.tensors)
-            cameras = rows_of(camera, intrinsics, distortion).with_all_tables()
+            cameras = camera_rows(camera, intrinsics, distortion).with_all_tables()
         with portable_export(rows) as order:
             return direction.formula(type(camera), rows, intrinsics, distortion, cameras, order)
-    cameras_of = cameras_of or partial(rows_of, camera)
+    cameras_of = cameras_of or partial(camera_rows, camera)
     known = cameras_of(intrinsics, distortion) if way.is_known else None
     if way.is_native and known is not None and (made := known.native) is not None:
         if way.learns:
@@ -118,7 +118,7 @@ def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Na
                 intrinsics, distortion = (t.expand(*batch, t.shape[-1]) for t in (intrinsics, distortion))
             if len(batch) != 1:
                 return None
-        native = rows_of(camera, intrinsics, distortion).native
+        native = camera_rows(camera, intrinsics, distortion).native
         if native is None:
             return None
         made.append(native)
@@ -160,7 +160,7 @@ class _Native(Function):
         return by_rows, *cameras.cotangents(sums, wanted[1:3]), None, None
 
 
-def rows_of(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> CameraRows:
+def camera_rows(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> CameraRows:
     """Return the rows' cameras, kept until a value changes."""
     cameras = kept_cameras(camera._memo, type(camera), intrinsics, distortion)
     # reading values would wait for another device

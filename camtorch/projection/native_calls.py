@@ -160,7 +160,7 @@ class Lattices:
             made.move = move
         move, cells = made.move, made.cells
         move.cameras, move.form, (move.height, move.width) = cameras, structs.POSITIONS, source_size
-        move.rows, move.row_strides[:] = rows_of(probes)
+        move.rows, move.row_strides[:] = address_and_strides(probes)
         move.results, move.result_strides[:], move.valid = self.nodes.data_ptr(), (2 * count, 1, count), valid
         move.count, move.tile, move.next = count, count, next_camera
         cells.nodes, cells.node_strides[:] = move.results, (2 * count, count)
@@ -189,7 +189,7 @@ class Lattices:
         return nodes, self.cells, exact[:, : self.counters[1]].clone()
 
 
-class Between:
+class NativeMove:
     """Cameras, and others that see their rays after a turn: maps pixels of the first to pixels of the others."""
 
     def __init__(self, start: Native, end: Native, turns: Tensor | None, size: tuple[int, int], is_batch: bool):
@@ -215,7 +215,7 @@ class Between:
         valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
         call, counters = structs.Move.from_buffer_copy(self._move), _kept.counters
         call.form, (call.height, call.width), call.count, call.tile = form, self._size, count, _TILE
-        call.rows, call.row_strides[:] = rows_of(pixels)
+        call.rows, call.row_strides[:] = address_and_strides(pixels)
         call.results, call.result_strides[:], call.valid = result.data_ptr(), (2 * count, 2, 1), valid.data_ptr()
         call.next = addressof(counters)
         tiles = -(-count // _TILE) * self.cameras if self.cameras * count >= _SHARED else 1
@@ -282,7 +282,7 @@ def _kept_memory(count: int) -> Tensor:
     return _kept.memory
 
 
-def rows_of(pixels: Tensor) -> tuple[int, tuple[int, int, int]]:
+def address_and_strides(pixels: Tensor) -> tuple[int, tuple[int, int, int]]:
     """Return the address of pixels (C or 1, N, 2), and their strides."""
     camera, point, component = pixels.stride()
     return pixels.data_ptr(), (camera if pixels.shape[0] > 1 else 0, point, component)

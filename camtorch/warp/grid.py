@@ -24,7 +24,7 @@ from camtorch.native.library import native_available
 from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_QUINTIC, CELL_TODO, POSITIONS, STEP
 from camtorch.poses.rotations import turn
 from camtorch.projection.evaluation import compiled_of
-from camtorch.projection.native_calls import Between
+from camtorch.projection.native_calls import NativeMove
 from camtorch.values.threads import on_one_thread
 from camtorch.warp.cells import Exact, classify, lay_quintics, places, prefer_quintics, put, settle
 from camtorch.warp.panorama import goes_round, lengths, off_poles, within_turn
@@ -220,7 +220,7 @@ def tabulate(
         lattice = on_lattice(source, target, rotation, tolerance, rows, padding)
         if lattice is not None:
             return lattice.pixels[:2]
-    exact = partial(_positions, source, target, rotation, _native(source, target, rotation, like))
+    exact = partial(_positions, source, target, rotation, _move_back(source, target, rotation, like))
     # by strips, which reuse the memory of intermediate results
     count = max(math.prod(c.batch_shape) for c in (source, target))
     count = count if rotation is None else max(count, math.prod(rotation.shape[:-2]))
@@ -236,7 +236,7 @@ def tabulate(
     return grid, mapped
 
 
-def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -> Between | None:
+def native_move(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -> NativeMove | None:
     """Return the native geometry from camera to camera for pixels of the dtype of `like`; None in a graph."""
     made = compiled_of((start, end), like, *(() if rotation is None else (rotation,)))
     if made is None:
@@ -244,13 +244,13 @@ def between(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -
     (one, other), is_batch = made
     if rotation is not None:
         is_batch, rotation = is_batch or rotation.ndim == 3, rotation.to(like.dtype)
-    return Between(one, other, rotation, end.size_for("Warp"), is_batch)
+    return NativeMove(one, other, rotation, end.size_for("Warp"), is_batch)
 
 
-def _native(source: Camera, target: Camera, rotation: Tensor | None, like: Tensor) -> Between | None:
+def _move_back(source: Camera, target: Camera, rotation: Tensor | None, like: Tensor) -> NativeMove | None:
     if goes_round(source) is not None or goes_round(target) is not None:
         return None
-    return between(target, source, None if rotation is None else rotation.mT, like)
+    return native_move(target, source, None if rotation is None else rotation.mT, like)
 
 
 def _like(target: Camera) -> Tensor:
@@ -268,7 +268,7 @@ def pixels_of_rows(target: Camera, rows: range) -> Tensor:
 
 
 def _positions(
-    source: Camera, target: Camera, rotation: Tensor | None, native: Between | None, pixels: Tensor
+    source: Camera, target: Camera, rotation: Tensor | None, native: NativeMove | None, pixels: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return where the source sees target pixels (h, w, 2) or (B, h, w, 2), and whether it does; see `Exact`."""
     if native is not None:
@@ -349,7 +349,7 @@ def on_lattice(
     n, m = math.ceil(height / STEP), math.ceil(width / STEP)  # cells
     if min(n, m) < FEWEST:
         return None
-    native = _native(source, target, rotation, like)
+    native = _move_back(source, target, rotation, like)
     if native is None and not are_free(like):
         return None
     nodes, size = (n + 5) * (m + 5), source.size_for("Warp")

@@ -9,7 +9,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.native.structs import ON_IMAGE, PIXELS
 from camtorch.poses.rotations import turn
 from camtorch.values.arguments import Numbers
-from camtorch.warp.grid import between
+from camtorch.warp.grid import native_move
 
 
 def moved_pixels(
@@ -17,7 +17,7 @@ def moved_pixels(
 ) -> tuple[Tensor, Tensor]:
     """Return pixels (B, *N, 2) or (*N, 2) of `start` as pixels of `end`, (-1, -1) for none, and their validity."""
     if isinstance(pixels, Tensor) and pixels.ndim > 0 and pixels.shape[-1] == 2:
-        ready = between(start, end, rotation, pixels)
+        ready = native_move(start, end, rotation, pixels)
         if ready is not None and ((pixels.ndim > 1 and pixels.shape[0] == ready.cameras) or not ready.is_batch):
             moved, valid = ready.rows(pixels.reshape(ready.cameras, -1, 2), ON_IMAGE if on_image else PIXELS)
             return moved.view(pixels.shape), valid.view(pixels.shape[:-1])

@@ -18,7 +18,7 @@ from camtorch.native import memory, structs
 from camtorch.native.library import loaded
 from camtorch.native.sampler import describe, is_quick, maker, takes, tiles_of
 from camtorch.projection.evaluation import compiled_of
-from camtorch.projection.native_calls import Between, Lattices, run_and_follow
+from camtorch.projection.native_calls import Lattices, NativeMove, run_and_follow
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 from camtorch.warp.grid import FEWEST, MOST_KEPT, coarse, kept_probes
@@ -37,7 +37,7 @@ _EVEN = 4  # samples a thread: with as many, threads that idle at the end matter
 _PIXELS = 1 << structs.LEFT_BITS  # C multiplies flags about pixels by this, to tell them from those about the lattice
 
 
-def between_of(warp: CameraPair) -> tuple[Native, Native, Tensor | None] | None:
+def natives_of(warp: CameraPair) -> tuple[Native, Native, Tensor | None] | None:
     """Return source, target and rotation of a warp for native code; None if it has to go step by step."""
     source, target, rotation = warp.source, warp.target, warp.rotation
     if not warp.is_an_operator or warp.is_pinned or goes_round(source) is not None or goes_round(target) is not None:
@@ -92,7 +92,7 @@ def _coarse(size: tuple[int, int], dtype: torch.dtype) -> tuple[Tensor, tuple[in
         return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).view(1, -1, 2), (len(v), len(u)), step
 
 
-def _surely_keeps_size(back: Between, sizes: Sizes) -> bool:
+def _surely_keeps_size(back: NativeMove, sizes: Sizes) -> bool:
     """Whether no image shrinks so far that a `MirrorWarp` would halve it; back: from the target to the source."""
     nodes, shape, step = _coarse(sizes[1], back.dtype)
     places = back.rows(nodes, structs.POSITIONS)[0].numpy().reshape(-1, *shape, 2)
@@ -224,7 +224,7 @@ class SampleCall:
             rotation = rotation.detach().to(dtype).contiguous()
         if self._decides:
             turns = None if rotation is None else rotation.mT
-            if not _surely_keeps_size(Between(target, source, turns, self._sizes[0], False), self._sizes):
+            if not _surely_keeps_size(NativeMove(target, source, turns, self._sizes[0], False), self._sizes):
                 return None
         call, turn = self._call, None if rotation is None else rotation.data_ptr()
         by_camera = 9 if rotation is not None and rotation.ndim > 2 and len(rotation) > 1 else 0

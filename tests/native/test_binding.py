@@ -16,7 +16,7 @@ from camtorch.native import build as building
 from camtorch.native import headers, self_test, structs
 from camtorch.native.library import library, native_available
 from camtorch.projection import native_calls
-from camtorch.projection.evaluation import rows_of as camera_rows
+from camtorch.projection.evaluation import camera_rows
 
 has_library = pytest.mark.skipif(not native_available(), reason="no compiled library is here")
 HERE = building._HERE
