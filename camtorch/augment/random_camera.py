@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch.augment.cameras import Auto, CameraDrawer, LensOptions
 from camtorch.augment.change import Part
+from camtorch.augment.drawer import Auto, CameraDrawer, LensOptions
 from camtorch.augment.fields import Named
 from camtorch.augment.presets import PresetName
 from camtorch.augment.ranges import RangeLike, as_range

@@ -346,7 +346,7 @@ def test_a_first_sample_of_any_form_warns_once(name, form, monkeypatch):
     image = torch.zeros(*SIZE, 3) if form == "numpy" else torch.zeros(3, *SIZE)
     fields = FORMS[form]({"image": image, **more})
     for is_error in (True, False):
-        monkeypatch.setattr("camtorch.augment.cameras._told", set())
+        monkeypatch.setattr("camtorch.augment.drawer._told", set())
         monkeypatch.setattr("camtorch.augment.landmarks._told", set())
         augment = make(20) if make is A.Resize else make()
         augment.camera = STRIP if name == "min_filled" else camera()
