@@ -10,7 +10,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import CameraNumbers, opaque
-from camtorch.native.structs import LOOKED_AT, SPREAD
+from camtorch.native.structs import FAR_ZOOM, HALVINGS, LOOKED_AT, MOST_ZOOM, NEARLY_FILLED, SPREAD, TURN_PARTS
 from camtorch.optics.radial_inverse import precise
 from camtorch.poses.rotations import rotation_matrix, rotation_vector
 from camtorch.values.arguments import broadcast_shapes
@@ -20,10 +20,6 @@ from camtorch.warp.moving import moved_pixels
 
 _ROOT = 1.324717957244746
 _CARE = 0.01  # largest error of the share that points measure
-_NEARLY = 0.999
-_ZOOM = 4.0  # at most, before the camera turns back
-_FAR_ZOOM = 1000.0  # of a camera that is not turned
-_TURNS = 1.0, 0.5, 0.25, 0.0
 
 
 def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
@@ -60,7 +56,7 @@ def _part_shown(
     pixels = pixels.expand(*broadcast_shapes(*shapes), *pixels.shape[-2:])
     _, shown = moved_pixels(target, source, None if rotation is None else rotation.mT, pixels, on_image=True)
     part = shown[..., :SPREAD].to(pixels.dtype).mean(-1)
-    return torch.where(shown[..., SPREAD:].all(-1), part, part.clamp(max=_NEARLY))
+    return torch.where(shown[..., SPREAD:].all(-1), part, part.clamp(max=NEARLY_FILLED))
 
 
 def scaled(camera: Camera, factor: Tensor) -> Camera:
@@ -101,14 +97,14 @@ def _enough(source: Camera, target: Camera, rotation: Tensor, share: float) -> t
     drawn = turned = rotation.expand(*found.shape, 3, 3)
     vector = None
     straight = bool((rotation == torch.eye(3, dtype=rotation.dtype, device=rotation.device)).all())
-    for part in _TURNS[-1:] if straight else _TURNS:
+    for part in TURN_PARTS[-1:] if straight else TURN_PARTS:
         if bool(done.all()):
             break
         if part != 1:
             vector = rotation_vector(precise(drawn)) if vector is None else vector
             turned = rotation_matrix(part * vector).to(rotation.dtype)
         at_first = found if part == 1 or straight else part_shown(turned)
-        zoom, now = _least_zoom(partial(part_shown, turned), at_first, share, _ZOOM if part else _FAR_ZOOM)
+        zoom, now = _least_zoom(partial(part_shown, turned), at_first, share, MOST_ZOOM if part else FAR_ZOOM)
         better = ~done & (now > found)
         factor, found = torch.where(better, zoom, factor), torch.where(better, now, found)
         rotation = torch.where(better[..., None, None], turned, rotation)
@@ -122,7 +118,7 @@ def _least_zoom(
     """Return the least factor (*B,) from 1 to `most`, and the part of the image that is filled with it."""
     low, high = torch.ones_like(at_first), torch.full_like(at_first, most)
     high, at_high = torch.where(at_first >= share, low, high), at_first
-    for _ in range(10):
+    for _ in range(HALVINGS):
         middle = (low * high).sqrt()
         at_middle = part_shown(middle)
         is_enough = at_middle >= share

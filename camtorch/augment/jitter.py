@@ -13,13 +13,11 @@ from torch import Tensor
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import CameraNumbers, opaque
 from camtorch.lenses.drawing import covering
-from camtorch.native.structs import AMOUNTS, RIM
+from camtorch.native.structs import AMOUNTS, JITTER_PARTS, RIM
 from camtorch.rays.lattices import defined_or, movement, polar_rays, reach
 from camtorch.values.module import remade
 from camtorch.warp.boxes import along_edges
 
-PARTS = 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125
-"""Parts of a step, in the order in which they are tried."""
 _SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move less than radial terms: as in real lenses
 _MOST_MEASURED = 64  # lenses whose measures are kept
 
@@ -50,7 +48,7 @@ def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]
     if len(rim) < len(steps):
         rim = rim.expand(len(steps), -1, -1)
     result, done = given, None
-    for part in PARTS:
+    for part in JITTER_PARTS:
         candidate, defined = defined_or(camera, given + part * steps, given)
         tried = remade(lens, intrinsics=lens.intrinsics.expand(len(candidate), 4), distortion=candidate)
         fits = tried.unproject(rim)[1].all(-1)

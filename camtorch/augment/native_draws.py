@@ -13,7 +13,7 @@ from torch import Tensor
 
 from camtorch.augment.change import LazyWarp
 from camtorch.augment.filling import looked_at, with_care
-from camtorch.augment.jitter import PARTS, border, lens_ends, measured_once, sensitivity
+from camtorch.augment.jitter import border, lens_ends, measured_once, sensitivity
 from camtorch.cameras.camera import Camera
 from camtorch.native import structs
 from camtorch.native.library import loaded
@@ -207,9 +207,9 @@ class Start:
         amounts = torch.from_numpy(np.asarray(values["distortion"]).reshape(-1, structs.AMOUNTS))
         steps = (amounts.repeat(1, -(-call.count // structs.AMOUNTS))[:, : call.count] * self._sensitivity)[:, None]
         given = self._distortion.double().reshape(-1, 1, call.count)
-        tried = (given + given.new_tensor(PARTS)[:, None] * steps).to(self._native.dtype)
+        tried = (given + given.new_tensor(structs.JITTER_PARTS)[:, None] * steps).to(self._native.dtype)
         tried, allowed = defined_or(self.base, tried, given.to(tried).expand_as(tried))
-        tried = tried.reshape(rows * len(PARTS), call.count)
+        tried = tried.reshape(rows * len(structs.JITTER_PARTS), call.count)
         lenses = CameraRows(model_of(self.base), tried.new_ones(len(tried), 4), tried)
         native = present(lenses.native, "compiled code for lenses like the base")
         native.add_table()

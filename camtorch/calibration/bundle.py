@@ -23,6 +23,7 @@ from camtorch.convert.fitting import bounds
 from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
 from camtorch.least_squares.jacobians import sensor_jacobians
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, rounding_of
+from camtorch.native.structs import LOST
 from camtorch.poses.rotations import small_turn
 from camtorch.projection import native_calls
 from camtorch.projection.evaluation import compiled_of
@@ -32,7 +33,6 @@ from camtorch.values.module import remade
 LOSSES = ("huber", "cauchy")
 SETTLED = 1e-10  # the squared distance to the optimum, over the variance, at which a search ends
 _NOTHING = 1e-11  # px, which counts as no error
-_LOST = 1e3  # px, the error of a seen point without a pixel
 
 
 class Poses(NamedTuple):
@@ -305,7 +305,7 @@ class Bundle:
         residuals = torch.where((valid & (observed.weights > 0))[..., None], pixels - observed.pixels, 0.0)
         u, v = residuals.unbind(-1)
         cost, slope = robust(self.loss, self.loss_scale, u * u + v * v)
-        lost, _ = robust(self.loss, self.loss_scale, cost.new_tensor(_LOST**2))
+        lost, _ = robust(self.loss, self.loss_scale, cost.new_tensor(LOST**2))
         cost = (torch.where(valid, cost, lost) * observed.weights).sum(-1)
         return compiled_poses.Errors(residuals, valid, torch.where(valid, slope * observed.weights, 0.0), cost)
 

@@ -12,12 +12,12 @@ from torch import Tensor
 from camtorch.cameras.operators import opaque
 from camtorch.lenses.collection import entries
 from camtorch.models import KannalaBrandt
+from camtorch.native.structs import TO_FOLD
 from camtorch.projection.domain import Domain
 
 _RMS = 1.0  # pixels
 _ASPECT = 0.05  # tolerance of the aspect ratio of pixels
 _CENTRE = 0.1  # of the image's sides: largest distance of the principal point from the middle
-FOLD = 0.98  # of the image's radius at the fold: closer to it a pixel is many degrees wide
 _PART = 256  # lenses whose tables stay in the processor's cache: eight times as fast as all at once
 _EDGE = 1e-3  # degrees: rounding of a field of view in float32
 
@@ -50,7 +50,7 @@ def covering(intrinsics: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor
     height, width = size
     across = torch.maximum(cx + 0.5, width - 0.5 - cx) / fx
     down = torch.maximum(cy + 0.5, height - 0.5 - cy) / fy
-    return (torch.hypot(across, down) / (FOLD * reach)).clamp(min=1.0)
+    return (torch.hypot(across, down) / (TO_FOLD * reach)).clamp(min=1.0)
 
 
 @lru_cache(maxsize=16)

@@ -13,16 +13,15 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
+from camtorch.native.structs import FAR, OUTSIDE
 from camtorch.values.dtypes import check_averaged, narrow, widen
 from camtorch.warp.arrays import Image, warped_alike
-from camtorch.warp.grid import OUTSIDE
 from camtorch.warp.warp import Warp
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
 _STRIP = 1 << 19  # pixels computed at a time
-_FAR = 100.0  # positions beyond are clamped, as in `Warp`: float32 and integers cannot hold all
 
 
 class Exact:
@@ -98,7 +97,7 @@ class LookupMap:
         """Return the grid (1, H', W', 2) float32 for `grid_sample(..., align_corners=False)`; -9 means no position."""
         size = self.positions.new_tensor(self.source_size[::-1])
         grid = ((2 * self.positions + 1) / size - 1).nan_to_num(OUTSIDE, OUTSIDE, OUTSIDE)
-        return grid.clamp(-_FAR, _FAR).float()[None]
+        return grid.clamp(-FAR, FAR).float()[None]
 
     def valid_mask(self) -> Tensor:
         """Return a mask (1, 1, H', W') bool: True if the pixel shows a part of the source's image."""

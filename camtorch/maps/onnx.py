@@ -15,8 +15,8 @@ import torch
 
 from camtorch.maps.lookup import Exact, LookupMap
 from camtorch.maps.protocol import MapFormat, checked
+from camtorch.native.structs import OUTSIDE
 from camtorch.values.arguments import imported
-from camtorch.warp.grid import OUTSIDE
 
 _OPSET, _IR = 16, 8
 _DTYPES = ("float32", "uint8")

@@ -180,7 +180,7 @@ static int is_rotation(const Turned *given) {
             off = miss <= off ? off : miss; /* or what is not a number */
         }
     const double x = m[1][1] * m[2][2] - m[1][2] * m[2][1], y = m[1][2] * m[2][0] - m[1][0] * m[2][2];
-    return off < 1e-3 && m[0][0] * x + m[0][1] * y + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0]) > 0;
+    return off < NEARLY_ROTATION && m[0][0] * x + m[0][1] * y + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0]) > 0;
 }
 
 /* A lattice, the images that are sampled on it, and other pixels of the same cameras, in one call on this thread: in between

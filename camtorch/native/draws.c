@@ -7,11 +7,6 @@
 #include "small.h"
 
 #define PI 3.14159265358979323846
-#define NEARLY 0.999
-#define MOST_ZOOM 4.0 /* before the camera turns back */
-#define FAR_ZOOM 1000.0 /* of a camera that is not turned */
-enum { HALVINGS = 10 };
-#define FOLD 0.98 /* of the image's radius at the end of a lens; see lenses/drawing.py */
 
 int64_t THIS(geometry)(const Rows *);
 int64_t THIS(moves)(const Move *);
@@ -61,7 +56,7 @@ static int64_t place(const Draws *d, int64_t c, double *f) {
     f[0] *= larger, f[1] *= larger;
     f[2] += drawn(d, CENTRE, 2, c, 0, 0) * d->width, f[3] += drawn(d, CENTRE, 2, c, 1, 0) * d->height;
     if (d->reach) { /* all pixels have rays */
-        const double factor = fmax(farthest(d, f) / (FOLD * d->reach[each]), 1);
+        const double factor = fmax(farthest(d, f) / (TO_FOLD * d->reach[each]), 1);
         f[0] *= factor, f[1] *= factor;
     }
     return 0;
@@ -104,7 +99,7 @@ static void ask(const Draws *d, Cameras *lens, const double *parameters, int lim
 
 /* Coefficients that move by drawn amounts: as far, or a part of it, as leaves the outline of the image invertible */
 static int64_t bend(Draws *d, int64_t c, const double *f, Cameras *found) {
-    static const double parts[TRIES + 1] = {1, -1, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125, 0};
+    static const double parts[TRIES + 1] = {JITTER_PARTS, 0};
     const int64_t is_double = d->made.is_double, each = d->is_each ? c : 0, wide = d->made.parameter_count;
     const Cameras made = only(&d->made, c);
     Cameras lens = *found;
@@ -195,13 +190,13 @@ static double shown(const Draws *d, int64_t c, const Cameras *lens, const double
     int count = 0;
     for (int i = 0; i < SPREAD; i++) count += valid[i];
     const double part = count / (double)SPREAD;
-    return all(valid + SPREAD, LOOKED_AT - SPREAD) ? part : fmin(part, NEARLY);
+    return all(valid + SPREAD, LOOKED_AT - SPREAD) ? part : fmin(part, NEARLY_FILLED);
 }
 
 /* Zooms, up to MOST_ZOOM, and then turns less far, until enough of the image shows something; `enough`. A flag of what is
    left, as of moves */
 static int64_t fill(const Draws *d, int64_t c, const Cameras *lens) {
-    static const double parts[] = {1, 0.5, 0.25, 0};
+    static const double parts[] = {TURN_PARTS};
     double given[9], turn[9], found, best = 1;
     int is_straight = 1;
     for (int i = 0; i < 9; i++) {

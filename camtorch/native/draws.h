@@ -8,11 +8,18 @@
 enum { YAW, PITCH, ROLL, ZOOM, WIDTH, FOCAL, CENTRE, DISTORTION, CROP, PLACE, DRAWN_KINDS };
 enum { AMOUNTS = 16 };
 enum { TRIES = 8 }; /* of steps of the coefficients, before they stay as they are */
+#define JITTER_PARTS 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125 /* of a step, in the order in which they are tried */
+#define TO_FOLD 0.98 /* of the image's radius at the fold: closer to it a pixel is many degrees wide */
 enum { RIM = 128 }; /* pixels along the edges of the image, and points of the plane along the end of a lens */
 /* What is left to do: the limits of azimuths of the base, new lenses and the source, and the ends of the base; or why there are no
    cameras: the lens does not reach that far, and a focal length is not positive, or a number not finite */
 enum { LEFT_BASE = 1, LEFT_LENS = 2, LEFT_ENDS = 4, TOO_WIDE = 8, NO_CAMERA = 16, LEFT_SOURCE = 32 };
 enum { SPREAD = 1000, LOOKED_AT = SPREAD + 64 }; /* pixels of a new image that are looked at, those of its rim at the end */
+#define NEARLY_FILLED 0.999 /* at most, if the rim shows something else */
+#define MOST_ZOOM 4.0       /* before the camera turns back */
+#define FAR_ZOOM 1000.0     /* of a camera that is not turned */
+#define TURN_PARTS 1.0, 0.5, 0.25, 0.0 /* of its turn that are left, in the order in which they are tried */
+enum { HALVINGS = 10 }; /* of the interval in which the zoom lies */
 
 /* Cameras (c) like others that move by drawn values. What is not wanted is NULL; numbers whose type is void are of that of
    the cameras */

@@ -132,8 +132,8 @@ enum { EDGE_POINTS = 64 }; /* along a side of a box; warp/boxes.py */
 /* What is left to do: pixels wait for the extent of `from`, points for the limits of `to`; most cells of a lattice want
    exact positions; or some box takes more than its outline, some pose has no rotation */
 enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4, LEFT_LABELS = 4 };
-#define OUTSIDE (-9)
-#define FAR 100 /* positions beyond are clamped to it */
+#define OUTSIDE -9.0f /* a position that no image reaches, not even with its interpolation margin */
+#define FAR 100.0f    /* positions beyond are clamped to it: grid_sample casts them to integers */
 
 /* Pixels of cameras `from`, by rays that are turned, to those of `to`; each as many as `cameras`, or one for all. All
    numbers are of the type of both */
@@ -183,6 +183,7 @@ typedef struct {
     int64_t strides[2]; /* of both, by vector and component */
     int64_t count, is_double, form;
 } Turned;
+#define NEARLY_ROTATION 1e-3 /* the largest deviation of R R^T from the identity */
 
 /* A sample: a lattice of one camera, images that are sampled on it, whole or by other calls, pixels that move, and
    vectors; or the pixels of a batch */

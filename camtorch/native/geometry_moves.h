@@ -217,7 +217,7 @@ static float T(most_missed)(const Classification *asked, int64_t first, const in
 
 /* Whether a cell lies far off the image; missed: by how much cubics miss each coordinate, squared */
 static int T(is_off)(const Classification *asked, int64_t first, const R *u, const R *v, const float *missed) {
-    const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2}, pixels = 4; /* two would do */
+    const float half[2] = {(float)asked->source_width / 2, (float)asked->source_height / 2};
     int is_off = 0;
     for (int c = 0; c < 2; c++) {
         const R *found = c ? v : u;
@@ -227,7 +227,7 @@ static int T(is_off)(const Classification *asked, int64_t first, const R *u, con
             low = exact < low ? exact : low, high = exact > high ? exact : high;
         }
         /* what lies between the places looked at */
-        const float reach = (high - low) / 2 + pixels / half[c];
+        const float reach = (high - low) / 2 + CELL_OFF / half[c];
         is_off |= (missed[c] < 1) & ((high + reach < -1) | (low - reach > 1));
     }
     return is_off;

@@ -1,4 +1,4 @@
-"""Write `structs.py`, the structures, enumerators and calls of the C files: `python -m camtorch.native.headers`.
+"""Write `structs.py`, the structures, numbers and calls of the C files: `python -m camtorch.native.headers`.
 
 The build, which needs no package, runs this file for `layout.h`, by which a library says what it was built with.
 """
@@ -10,7 +10,7 @@ import re
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 _HERE = Path(__file__).resolve().parent
 # types of fields, and of what calls take and return: in ctypes, and of their values
@@ -19,8 +19,9 @@ _FIELDS["double"] = "c_double", "float"
 _GIVEN = {"int64_t": ("c_int64", "int"), "double*": ("c_void_p", "int"), "char*": ("c_char_p", "bytes")}
 _RESULTS = _GIVEN | {"int32_t": ("c_int32", "int"), "unsigned": ("c_uint32", "int"), "void": ("None", "None")}
 _DECLARED = re.compile(r"\benum\s*\{([^}]*)\}|typedef struct \{([^}]*)\}\s*(\w+);")
+_NUMBERS = re.compile(r"^#define (\w+) ((?:(?:, )?-?\d[\d.e-]*f?)+)$", re.M)
 _CALL = re.compile(r"^EXPORTED (?:const )?(\w+ \*?)camtorch_(\w+)\((.*)\) \{|\bENTRY\((\w+), (\w+), (.*?)\)", re.M)
-_HEAD = '''"""The structures, enumerators and calls of the C files: `python -m camtorch.native.headers` writes them."""
+_HEAD = '''"""The structures, numbers and calls of the C files: `python -m camtorch.native.headers` writes them."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ class Shared(NamedTuple):
     """What Python and C share: fields with their type, or "*", and number, 0 if alone; results and types of calls."""
 
     structs: dict[str, dict[str, tuple[str, int]]]
-    values: dict[str, int]
+    values: dict[str, Any]
     calls: dict[str, tuple[str, list[str]]]
 
     @property
@@ -47,7 +48,9 @@ class Shared(NamedTuple):
 def read(folder: Path = _HERE) -> Shared:
     """Read `dispatch.c` and the headers that it includes."""
     found, text = Shared({}, {}, {}), (folder / "dispatch.c").read_text("utf-8")
-    for values, fields, name in _DECLARED.findall(_included(folder, text, set())):
+    headers = _included(folder, text, set())
+    found.values.update((name, eval(numbers.replace("f", ""))) for name, numbers in _NUMBERS.findall(headers))
+    for values, fields, name in _DECLARED.findall(headers):
         if name:
             found.structs[name] = dict(_fields(name, fields, found))
         following = 0
@@ -67,7 +70,7 @@ def _included(folder: Path, text: str, seen: set[str]) -> str:
     for name in re.findall(r'^#include "(.*)"', text, re.M):
         if name not in seen:
             seen.add(name)
-            header = re.sub(r"/\*.*?\*/", "", (folder / name).read_text("utf-8"), flags=re.S)
+            header = re.sub(r" */\*.*?\*/", "", (folder / name).read_text("utf-8"), flags=re.S)
             texts += [_included(folder, header, seen), header]
     return "\n".join(texts)
 

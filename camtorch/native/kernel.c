@@ -1708,11 +1708,6 @@ int32_t THIS(sample)(Job *job) {
 
 /* -- which cells of a lattice want exact positions */
 
-static const float CUBIC = 3 / 128.0f;  /* a cubic through four even nodes misses its middle by this part of their fourth difference */
-static const float SAFETY = 3;          /* times that is assumed: at a step of the curvature, fourth differences tell less */
-static const float MARGIN = 0.05f;      /* of half an image: what lies beyond is not sampled */
-static const float OVERSHOOT = 0.5f;    /* of the range of its nodes by which a cubic may leave it: 0.27 along each axis */
-
 /* By differences of differences, which numbers that lie close together have without roundings */
 INLINE float fourth(float a, float b, float c, float d, float e) {
     const float ab = b - a, bc = c - b, cd = d - c, de = e - d;
@@ -1761,7 +1756,7 @@ NOT_INLINE void judge(const float *across, const float *down, float scale, const
     int64_t j;
     for (j = 0; j < n; j++) {
         const float of = scale * (across[j] + down[j]);
-        const float reach = MARGIN + OVERSHOOT * (high[j] - low[j]);
+        const float reach = CELL_MARGIN + CELL_OVERSHOOT * (high[j] - low[j]);
         const float is_near = (high[j] + reach > -1 ? 1.0f : 0.0f) * (low[j] - reach < 1 ? 1.0f : 0.0f);
         /* beyond the border, one coordinate does not matter, but the other one does */
         missed[j] += greater(is_near, not_border) * of * of;
@@ -1801,7 +1796,7 @@ int32_t THIS(classify)(const Classification *given) {
                             of[(i + 2 < given->rows ? i + 2 : given->rows) % 4], n, lines[3 + k]);
                 }
                 ranges(nodes + width + 1, width, n, lines[5], lines[6], lines[7], lines[8]);
-                judge(lines[3], lines[4], SAFETY * CUBIC * half[c], lines[7], lines[8], n, not_border, not_zeros, missed,
+                judge(lines[3], lines[4], CELL_MISSED * half[c], lines[7], lines[8], n, not_border, not_zeros, missed,
                       near);
             }
             uint8_t *sums = (uint8_t *)lines[2];

@@ -19,6 +19,11 @@ enum { SCRATCH = 25 };
 enum { STEP = 8 }; /* pixels between the nodes of a lattice */
 /* quintics do there, which are to be laid; cubics may miss; to be computed next; and others that have no place in `exact` */
 enum { CELL_QUINTIC = -5, CELL_DOUBT, CELL_NEXT, CELL_EMPTY, CELL_CUBIC, CELL_TODO };
+#define CELL_MISSED 0.0703125f /* of fourth differences of nodes, by which cubics may miss the middle of a cell: 3 / 128 of even
+                                  ones, and three times that, as differences tell less at a step of the curvature */
+#define CELL_MARGIN 0.05f      /* of half an image: what lies beyond is not sampled */
+#define CELL_OVERSHOOT 0.5f    /* of the range of its nodes by which a cubic may leave it: 0.27 along each axis */
+#define CELL_OFF 4.0f          /* pixels by which cells that may be left out are off the image: two would do */
 
 typedef struct {
     /* images (b, c, y, x) and results, in elements; a source image may serve all results (stride 0) */

@@ -1,4 +1,4 @@
-"""The structures, enumerators and calls of the C files: `python -m camtorch.native.headers` writes them."""
+"""The structures, numbers and calls of the C files: `python -m camtorch.native.headers` writes them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,22 @@ from ctypes import POINTER, c_char_p, c_double, c_int32, c_int64, c_uint32, c_vo
 
 from camtorch.native.structure import Calls, Numbers, Struct
 
-CHECKSUM = 3751767004
+CHECKSUM = 4162976654
 
+CELL_MISSED = 0.0703125
+CELL_MARGIN = 0.05
+CELL_OVERSHOOT = 0.5
+CELL_OFF = 4.0
+OUTSIDE = -9.0
+FAR = 100.0
+NEARLY_ROTATION = 0.001
+JITTER_PARTS = (1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.125, -0.125)
+TO_FOLD = 0.98
+NEARLY_FILLED = 0.999
+MOST_ZOOM = 4.0
+FAR_ZOOM = 1000.0
+TURN_PARTS = (1.0, 0.5, 0.25, 0.0)
+LOST = 1000.0
 UINT8 = 0
 BOOL = 1
 UINT16 = 2
@@ -105,6 +119,7 @@ NO_CAMERA = 16
 LEFT_SOURCE = 32
 SPREAD = 1000
 LOOKED_AT = 1064
+HALVINGS = 10
 FROM_RAYS = 0
 REFINED = 1
 SOLVED = 2

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.tensors import are_free, as_own, known_false, known_true
+from camtorch.native.structs import NEARLY_ROTATION
 from camtorch.optics.special import angle_per_radius, cos_root, cosc_root, sinc_root
 from camtorch.values.arguments import Numbers, as_real, as_rows, as_values, check_devices
 
-_NEARLY = 1e-3  # the largest deviation of R R^T from the identity
 _FEW = 16  # matrices that plain numbers check faster than operators of torch do
 
 
@@ -110,7 +110,7 @@ def are_rotations(matrix: Tensor) -> Tensor:
     """Whether (*B, 3, 3) are rotations, (*B) bool, to the precision of files or of their dtype."""
     values, precision = matrix.detach().double(), 4 * torch.finfo(matrix.dtype).eps
     proper: Tensor = torch.linalg.det(values) > 0
-    return (rotation_error(values) < max(_NEARLY, precision)) & proper
+    return (rotation_error(values) < max(NEARLY_ROTATION, precision)) & proper
 
 
 def rotation_error(values: Tensor) -> Tensor:
@@ -145,7 +145,7 @@ def is_right(matrix: Tensor) -> bool:
         squares = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
         products = a * d + b * e + c * f, d * g + e * h + f * i, g * a + h * b + i * c
         misses = max(max(squares) - 1, 1 - min(squares), max(products), -min(products))
-        if not (misses < _NEARLY and a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0):
+        if not (misses < NEARLY_ROTATION and a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0):
             return False
     return True
 

@@ -10,19 +10,23 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch.native.structs import CELL_CUBIC, CELL_DOUBT, CELL_EMPTY, CELL_QUINTIC, CELL_TODO, STEP
+from camtorch.native.structs import (
+    CELL_CUBIC,
+    CELL_DOUBT,
+    CELL_EMPTY,
+    CELL_MARGIN,
+    CELL_MISSED,
+    CELL_OFF,
+    CELL_OVERSHOOT,
+    CELL_QUINTIC,
+    CELL_TODO,
+    STEP,
+)
 
 Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Pixels (h, w, 2) for every camera, or (B, h, w, 2) for each its own, to positions (B or 1, h, w, 2) as of
 `grid_sample`, `OUTSIDE` where no ray is mapped, and bool (B or 1, h, w): whether one is."""
 
-# the numbers of `classify` and `settle` in native/kernel.c and native/geometry_moves.h
-_MISSED = 3 * 3 / 128  # of fourth differences: by how much cubics miss the middle of a cell, three times for safety
-_MARGIN, _OVERSHOOT = (
-    0.05,
-    0.5,
-)  # of half an image beyond which nothing is sampled; by which cubics may leave their nodes
-_FAR_OFF = 4  # pixels
 _PROBES = ((4, 0), (0, 4), (8, 4), (4, 8), (4, 4))  # across and down: the middles of a cell's sides, and its own
 _MIDDLE = {4: (0.0, -1 / 16, 9 / 16, 9 / 16, -1 / 16, 0.0), 6: tuple(w / 256 for w in (3, -25, 150, 150, -25, 3))}
 """Weights of six nodes in the middle of a cubic through four of them, and of a quintic."""
@@ -49,8 +53,8 @@ def classify(
         most = torch.maximum(most.narrow(dim, 1, most.shape[dim] - 1), most.narrow(dim, 0, most.shape[dim] - 1))
         most = torch.maximum(most.narrow(dim, 2, most.shape[dim] - 2), most.narrow(dim, 0, most.shape[dim] - 2))
     across, down, high, low, some, every = most.split((2, 2, 2, 2, 1, 1), 1)
-    missed = (_MISSED * half * (across + down)).square()
-    reach = _MARGIN + _OVERSHOOT * (high + low)
+    missed = (CELL_MISSED * half * (across + down)).square()
+    reach = CELL_MARGIN + CELL_OVERSHOOT * (high + low)
     near = (high + reach > -1) & (low + reach > -1)
     # beyond the border one coordinate does not matter, but the other one does
     missed = (missed * near if padding == "border" else missed).sum(1)
@@ -109,7 +113,7 @@ def settle(
     if padding == "zeros":
         seen = torch.cat((positions, around[..., 2, 2, None]), -1)
         low, high = seen.aminmax(dim=-1)
-        reach = (high - low) / 2 + _FAR_OFF / half  # the range of positions, with a margin for those between the probes
+        reach = (high - low) / 2 + CELL_OFF / half  # the range of positions, with a margin for those between the probes
         is_off = (by_cubics.amax(-1) < 1) & ((high + reach < -1) | (low - reach > 1))
         is_cubic |= is_off.any(-1)
     # a quarter of that, and of what cubics miss: where the curvature steps, quintics gain nothing, and swing

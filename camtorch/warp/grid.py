@@ -21,7 +21,7 @@ from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_free, are_plain, is_unknown
 from camtorch.native import sampler
 from camtorch.native.library import native_available
-from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_QUINTIC, CELL_TODO, POSITIONS, STEP
+from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_QUINTIC, CELL_TODO, FAR, OUTSIDE, POSITIONS, STEP
 from camtorch.poses.rotations import turn
 from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.native_calls import NativeMove
@@ -29,8 +29,6 @@ from camtorch.values.threads import on_one_thread
 from camtorch.warp.cells import Exact, classify, lay_quintics, places, prefer_quintics, put, settle
 from camtorch.warp.panorama import goes_round, lengths, off_poles, within_turn
 
-OUTSIDE = -9.0  # a sampling position that no image reaches, not even with its interpolation margin
-_FAR = 100.0  # positions beyond are clamped to it: grid_sample casts them to integers
 _STRIP = 1 << 19  # pixels
 FEWEST = 8  # cells along a side: with fewer, exact positions take less time than a lattice
 _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
@@ -292,12 +290,12 @@ def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
     if may_look(seen) and are_plain(seen):
         for plane, side in zip(seen.unbind(-1), size[::-1], strict=True):
             plane.mul_(2 / side).add_(1 / side - 1)
-        seen.clamp_(-_FAR, _FAR)
+        seen.clamp_(-FAR, FAR)
         if not bool(mapped.all()):
             seen.masked_fill_(~mapped.unsqueeze(-1), OUTSIDE)
         return seen
     planes = [
-        (plane * (2 / side) + (1 / side - 1)).clamp(-_FAR, _FAR)
+        (plane * (2 / side) + (1 / side - 1)).clamp(-FAR, FAR)
         for plane, side in zip(seen.unbind(-1), size[::-1], strict=True)
     ]
     return torch.where(mapped, torch.stack(planes), OUTSIDE).movedim(0, -1)

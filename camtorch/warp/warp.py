@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import is_exporting
+from camtorch.native.structs import OUTSIDE
 from camtorch.poses.rotations import as_rotation, turn
 from camtorch.values.arguments import (
     LEFT,
@@ -26,7 +27,6 @@ from camtorch.values.arguments import (
 from camtorch.values.dtypes import check_averaged
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
-from camtorch.warp.grid import OUTSIDE
 from camtorch.warp.plan import CameraPair, WarpPlan
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, Options, PaddingMode, Sampler, as_fill, as_options
 

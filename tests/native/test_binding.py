@@ -75,6 +75,7 @@ FIELD = "    int64_t next; /* the next tile that a free thread takes */\n"
         ("geometry.h", "flags, factor, n, m;", "flags, factor, n, m, more;", "its structures"),  # where nothing moves
         ("sampler.h", "int64_t cell_stride, rows, columns", "int64_t cell_stride, columns, rows", "its structures"),
         ("sampler.h", "SCRATCH = 25", "SCRATCH = 26", "its structures"),
+        ("sampler.h", "CELL_MARGIN 0.05f", "CELL_MARGIN 0.06f", "its structures"),
         ("dispatch.c", "ENTRY(void, views, const Views *)", "ENTRY(void, views, const Steps *)", "its structures"),
         ("sampler.h", "", "", "camtorch_geometry gives a wrong answer to a known call"),
     ],
