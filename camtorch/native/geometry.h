@@ -28,6 +28,13 @@ enum { NODES = 1024 };   /* of the table of an inverse, see `radial_inverse.tabu
 enum { MOST_RADII = 512 }; /* on which a lens is followed outwards by bounds of its stages */
 enum { AZIMUTHS = 336 }; /* on which limits are given, see `fold.limits_and_extent` */
 enum { RADII = 80 };     /* on each of them: half over the whole chart, half around the fold of a radial factor */
+enum { DIP = 65 };       /* radii at which a dip between two of them is sampled */
+#define SMOOTH 0.02 /* by how much a fold may differ from one azimuth to the next, and how far it bulges between them, if so */
+#define BULGE 0.001
+#define FAR_IMAGE 20.0 /* focal lengths: no image goes further, and there lenses may differ much between two azimuths */
+#define BEYOND 1.01    /* what an extent allows for outside of its rim and, in azimuths, next to it */
+enum { ASIDE = 4 };
+enum { SPAN = 12 }; /* azimuths that the rim may go on from one to the next, and next to it; else it is a circle */
 /* Radii (RADII); how far out they are sent on each azimuth (AZIMUTHS, RADII), ascending; how far the image reaches in each
    direction (AZIMUTHS) */
 enum { EXTENT = RADII + AZIMUTHS * RADII + AZIMUTHS };

@@ -2,12 +2,6 @@
  * inverse; projection/fold.py, which says why.
  */
 
-enum { DIP = 65, SPAN = 12, ASIDE = 4 };
-#define SMOOTH 0.02
-#define BULGE 0.001
-#define BEYOND 1.01
-#define FAR_IMAGE 20.0
-
 /* Of radii at fractional places; infinite from RADII on */
 static double radius_at(const double *radii, double place) {
     const int index = place < RADII - 1 ? (int)place : RADII - 1, next = index < RADII - 1 ? index + 1 : index;

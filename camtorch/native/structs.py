@@ -7,12 +7,16 @@ from ctypes import POINTER, c_char_p, c_double, c_int32, c_int64, c_uint32, c_vo
 
 from camtorch.native.structure import Calls, Numbers, Struct
 
-CHECKSUM = 4162976654
+CHECKSUM = 595640963
 
 CELL_MISSED = 0.0703125
 CELL_MARGIN = 0.05
 CELL_OVERSHOOT = 0.5
 CELL_OFF = 4.0
+SMOOTH = 0.02
+BULGE = 0.001
+FAR_IMAGE = 20.0
+BEYOND = 1.01
 OUTSIDE = -9.0
 FAR = 100.0
 NEARLY_ROTATION = 0.001
@@ -78,6 +82,9 @@ NODES = 1024
 MOST_RADII = 512
 AZIMUTHS = 336
 RADII = 80
+DIP = 65
+ASIDE = 4
+SPAN = 12
 EXTENT = 27296
 PROJECT = 0
 UNPROJECT = 1

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.export import as_index
-from camtorch.native.structs import AZIMUTHS
+from camtorch.native.structs import ASIDE, AZIMUTHS, BEYOND, BULGE, DIP, FAR_IMAGE, RADII, SMOOTH, SPAN
 from camtorch.optics.radial_inverse import first_loss
 from camtorch.values.arguments import columns
 
@@ -19,12 +19,6 @@ if TYPE_CHECKING:
     from camtorch.optics.radial import RadialFactor
 
 _RADII = 2048  # to find the fold of the radial factor
-_SMOOTH, _BULGE = 0.02, 0.001
-_DIP = 65  # radii at which a dip between two nodes is sampled
-_COARSE, _CLOSE = 40, 40  # on each of many azimuths: over the whole chart, and around the fold of the radial factor
-_FAR = 20.0  # focal lengths: no image goes further, and there lenses may differ much between two azimuths
-_BEYOND, _ASIDE = 1.01, 4  # an extent is larger than its rim by this factor, and wider by so many azimuths
-_SPAN = 12  # azimuths that the rim may go on from one to the next, and next to it; else it is a circle
 
 
 def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
@@ -48,11 +42,11 @@ def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
     nearer, further = ends.amin(-1), ends.amax(-1)
     # Between two azimuths the fold moves smoothly, and may bulge: the orientation decides where it lies.
     # If it ends there, the nearer one is on the safe side.
-    smooth = (pairs.diff(dim=-1).squeeze(-1).abs() <= 1.5) | (further <= (1 + _SMOOTH) * nearer)
-    limit = torch.where(smooth, further * (1 + _BULGE), nearer).unsqueeze(-1)
+    smooth = (pairs.diff(dim=-1).squeeze(-1).abs() <= 1.5) | (further <= (1 + SMOOTH) * nearer)
+    limit = torch.where(smooth, further * (1 + BULGE), nearer).unsqueeze(-1)
     limits = limit.clamp(max=chart.end(limit.dtype)).squeeze(-1).unflatten(0, (-1, AZIMUTHS))
     envelope = _envelope(*rim)
-    return limits * limits, Extent(radii, reach, torch.where(envelope < _FAR, envelope, torch.inf))
+    return limits * limits, Extent(radii, reach, torch.where(envelope < FAR_IMAGE, envelope, torch.inf))
 
 
 def _follow(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
@@ -107,20 +101,20 @@ def _envelope(furthest: Tensor, x: Tensor, y: Tensor) -> Tensor:
     turn = (here.roll(-1, -1) - here + AZIMUTHS // 2).remainder(AZIMUTHS) - AZIMUTHS // 2
     level = torch.maximum(furthest, furthest.roll(-1, -1))
     envelope = torch.zeros_like(level)
-    for step in range(-_SPAN, _SPAN + 1):
-        between = (step >= turn.clamp(max=0) - _ASIDE) & (step <= turn.clamp(min=0) + _ASIDE)
+    for step in range(-SPAN, SPAN + 1):
+        between = (step >= turn.clamp(max=0) - ASIDE) & (step <= turn.clamp(min=0) + ASIDE)
         direction = (here + step).remainder(AZIMUTHS)
         envelope = envelope.scatter_reduce(-1, direction, torch.where(between, level, 0.0), "amax")
     # it becomes a circle if the rim has no end, turns by leaps, or is not seen to go once around the centre
-    leaps = (level == torch.inf) | (turn.abs() > _SPAN - _ASIDE) | (turn.sum(-1, keepdim=True) != AZIMUTHS)
+    leaps = (level == torch.inf) | (turn.abs() > SPAN - ASIDE) | (turn.sum(-1, keepdim=True) != AZIMUTHS)
     circle = torch.where(leaps.any(-1, keepdim=True), level.amax(-1, keepdim=True), 0.0)
-    return _BEYOND * torch.maximum(envelope, circle)
+    return BEYOND * torch.maximum(envelope, circle)
 
 
 def _find_loss(lens: Lens, a: Tensor, b: Tensor, radii: Tensor, orientation: Tensor) -> Tensor:
     """Return `first_loss` (M,), but dips between coarse nodes (M, S) count only if a closer look finds them."""
     last = orientation.shape[-1] - 1
-    steps = torch.linspace(-1, 1, _DIP, dtype=orientation.dtype, device=orientation.device)
+    steps = torch.linspace(-1, 1, DIP, dtype=orientation.dtype, device=orientation.device)
 
     def assumed(lost: Tensor) -> Tensor:
         node = lost.round().long().clamp(max=last).unsqueeze(-1)
@@ -168,14 +162,14 @@ def _last_not_above(table: Tensor, row: Tensor, length: int, target: Tensor) -> 
 def _around(radial: RadialFactor | None, chart: Chart, fine: Tensor) -> Tensor:
     """Return radii (C, radii): the chart's, and more of them close to the fold of the radial factor, if it has one."""
     if radial is None:
-        return chart.radii(_COARSE + _CLOSE, fine)
+        return chart.radii(RADII, fine)
     orientation = radial.orientation(fine)
     fold = _radius_at(fine.expand_as(orientation), first_loss(orientation).unsqueeze(-1))
     # without a fold on the chart, the middle of the chart does no harm
     fold = torch.where(fold < torch.inf, fold, 1.0)
-    spread = 1 + 0.5 * torch.linspace(-1, 1, _CLOSE, dtype=fine.dtype, device=fine.device) ** 3
+    spread = 1 + 0.5 * torch.linspace(-1, 1, RADII // 2, dtype=fine.dtype, device=fine.device) ** 3
     close = (fold * spread).clamp(max=fine[-1])
-    coarse = chart.radii(_COARSE, fine).expand(*close.shape[:-1], -1)
+    coarse = chart.radii(RADII // 2, fine).expand(*close.shape[:-1], -1)
     return torch.cat((coarse, close), -1).sort(-1).values
 
 
