@@ -27,7 +27,7 @@ def way(request, monkeypatch):
         pytest.skip("there is no compiled library")
     if request.param == "torch":
         monkeypatch.setattr(grid, "native_available", lambda: False)
-        monkeypatch.setattr(grid, "_native", lambda *_: None)
+        monkeypatch.setattr(grid, "_move_back", lambda *_: None)
 
 
 def check(source, target, rotation):
@@ -91,7 +91,7 @@ def test_torch_doubts_the_cells_that_compiled_code_doubts(key, monkeypatch):
             compiled = grid.on_lattice(*given)
             with monkeypatch.context() as patch:
                 patch.setattr(grid, "native_available", lambda: False)
-                patch.setattr(grid, "_native", lambda *_: None)
+                patch.setattr(grid, "_move_back", lambda *_: None)
                 patch.setattr(grid, "classify", both)
                 laid = grid.on_lattice(*given)
             if compiled is not None and laid is not None:
