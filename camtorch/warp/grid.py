@@ -363,7 +363,7 @@ def on_lattice(
     narrow, limits = lattice.float(), (size, tolerance, padding)
     cells = find(narrow, mapped, rim, (height, width), *limits)
     settle(exact, rows.start, cells, narrow, mapped, *limits)
-    if int((cells == CELL_TODO).sum((1, 2)).max()) > n * m * (1 / 5 if learns else 7 / 8):
+    if not len(cells) or int((cells == CELL_TODO).sum((1, 2)).max()) > n * m * (1 / 5 if learns else 7 / 8):
         return None
     computed = _compute(exact, rows.start, cells, cells == CELL_TODO, like)
     if not learns:

@@ -1,5 +1,6 @@
 """Laws of positions from a lattice: they keep their tolerance, and lose no pixel."""
 
+import copy
 import itertools
 import json
 import math
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
-from cameras import RARE_ARE_SLOW, each_kind, make, real, turn
+from cameras import RARE_ARE_SLOW, each_kind, make, one, real, turn
 
 import camtorch as ct
 from camtorch.native import sampler
@@ -123,6 +124,59 @@ def test_hard_warps_keep_their_tolerance(what):
         for of in (case["source"], case["target"])
     )  # fmt: skip
     check(source, target, None if case["rotation"] is None else torch.tensor(case["rotation"], dtype=dtype))
+
+
+def check_numbers(camera, source, target, rotation=None):
+    """Those of the camera's numbers, by noise in every pixel, are those of exact positions."""
+    found, noise = [], torch.randn(1, *target.image_size, 2, generator=torch.Generator().manual_seed(0))
+    for tolerance in (0.0, None):
+        where = ct.Warp(source, target, rotation, tolerance=tolerance).by_pixel()
+        shown = where.mapped & (where.grid.detach().abs() <= 1).all(-1)
+        learning = [t for t in camera.tensors if t.requires_grad]
+        found.append(torch.autograd.grad((where.grid * noise)[shown].sum(), learning))
+    for exact, close in zip(*found, strict=True):
+        assert (exact - close).norm() <= 3e-3 * exact.norm()  # polynomials in the angle have a kink on the axis
+
+
+def check_both_ways(camera):
+    camera = camera.float().resize(120, 160).requires_grad_()
+    other = ct.Pinhole(torch.tensor([70.0, 72.0, 80.3, 59.1]), image_size=(120, 160)).requires_grad_(False)
+    check_numbers(camera, camera, other)
+    check_numbers(camera, other, camera)
+
+
+@pytest.mark.parametrize("key", RARE_ARE_SLOW)
+@pytest.mark.usefixtures("way")
+def test_gradients_are_those_of_exact_positions(key):
+    check_both_ways(one(key))
+
+
+@pytest.mark.usefixtures("way")
+def test_gradients_of_pieces_narrower_than_cells_are_exact():
+    """A piece bends what it shapes also where all of them together are smooth."""
+    angles = torch.linspace(0.0, 1.3, 31)[1:]
+    numbers = torch.tensor([70.0, 72.0, 80.3, 59.1])
+    table = ct.Tabulated(numbers, torch.cat((angles, angles)), image_size=(120, 160))
+    surface = ct.Splined.with_grid(columns=30, rows=20, fov_x=100)(numbers, image_size=(120, 160))
+    check_both_ways(table)
+    check_both_ways(surface)
+    check_both_ways(ct.Mixed([table, surface]))
+
+
+@pytest.mark.usefixtures("way")
+def test_gradients_of_a_whole_turn_are_exact_where_it_begins_again():
+    """Positions go on there, derivatives by the focal length do not."""
+    focal = 256 / math.tau
+    camera = ct.Cylindrical(torch.tensor([focal, focal, 127.5, 63.5]), image_size=(128, 256))
+    check_numbers(camera, copy.deepcopy(camera).requires_grad_(False), camera, turn(12.0, -7.0, 20.0))
+
+
+@pytest.mark.parametrize("learns", [True, False])
+@pytest.mark.usefixtures("way")
+def test_no_cameras_make_no_images(learns):
+    none = ct.Pinhole(torch.zeros(0, 4), image_size=(80, 96)).requires_grad_(learns)
+    target = ct.Pinhole(torch.tensor([85.0, 86.0, 60.0, 50.0]), image_size=(96, 112)).requires_grad_(False)
+    assert ct.Warp(none, target)(torch.zeros(0, 3, 80, 96)).shape == (0, 3, 96, 112)
 
 
 def test_points_of_a_pinned_warp_are_those_of_its_cameras_and_learn_with_them():
