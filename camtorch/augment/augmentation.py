@@ -25,6 +25,7 @@ from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.door import has_tangent, keeps_graph, may_look
 from camtorch.evaluate.tensors import are_known, are_numbers, known_false, known_true
 from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_part, as_whole, hinting, warn
+from camtorch.values.module import typed_as
 from camtorch.warp.warp import Warp
 
 _FEW = 2 / 3  # of what an image shows of its own camera: with less than that, on average, it warns
@@ -436,7 +437,9 @@ class Augmentation(SampleTransform):
         return self.with_boxes(draw, boxes.flatten(0, -3)[:1] if getattr(boxes, "ndim", 0) > 3 else boxes)
 
     if TYPE_CHECKING:
-        __call__ = forward  # nn.Module's has no types
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def extra_repr(self) -> str:
         parts = [f"camera={self.camera:g}"] if isinstance(self.camera, Guess) else []

@@ -18,6 +18,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import known_false
 from camtorch.poses.rotations import check_rotation, rotation_matrix
 from camtorch.values.arguments import as_known_size, as_number, no_camera, shown
+from camtorch.values.module import typed_as
 from camtorch.warp.views import pinhole
 from camtorch.warp.warp import Warp
 
@@ -179,7 +180,9 @@ class FaceNormalizer(SampleTransform):
         return moved
 
     if TYPE_CHECKING:
-        __call__ = forward  # nn.Module's has no types
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def extra_repr(self) -> str:
         options = {"focal": self.focal, "distance": self.distance, "image_size": self.image_size, **self.options}

@@ -33,7 +33,7 @@ from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_cent
 from camtorch.rays.lattices import field_of_view, movement
 from camtorch.rays.polyline import project_polyline
 from camtorch.values.arguments import Numbers, as_number, broadcast_shapes, hinting, warn
-from camtorch.values.module import GeometryModule
+from camtorch.values.module import GeometryModule, typed_as
 
 Model = TypeVar("Model", bound="Camera", default="Camera")
 
@@ -343,7 +343,9 @@ class Camera(Freezable, Editable):
         return self.project(points)
 
     if TYPE_CHECKING:
-        __call__ = forward  # nn.Module's has no types
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def project(self, points: Numbers) -> tuple[Tensor, Tensor]:
         """Project points, or rays, of the camera frame to pixels.

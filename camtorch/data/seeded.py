@@ -77,6 +77,8 @@ class Seeded:
         TypeError: If it is another transform. ValueError: If it draws for whole batches (`same_on_batch`).
     """
 
+    augmentation: Transform | Augmentation
+
     def __init__(self, augmentation: Augmentation | Transform, *, seed: int = 0, epoch: int = 0):
         inner = augmentation.augmentation if isinstance(augmentation, Transform) else augmentation
         if not isinstance(inner, Augmentation):

@@ -17,6 +17,7 @@ from camtorch.cameras.editing import edited
 from camtorch.cameras.mixed import Mixed
 from camtorch.rays.lattices import slopes_at_axis
 from camtorch.values.arguments import as_image_size, as_number, no_camera, shown
+from camtorch.values.module import typed_as
 from camtorch.warp.affine import AffineWarp
 
 
@@ -54,6 +55,9 @@ class CanonicalCamera(SampleTransform):
     Raises:
         ValueError: If the focal length is not positive, `scales` is another word, or a size is given with "depth".
     """
+
+    focal: float
+    image_size: tuple[int, int] | None
 
     def __init__(
         self,
@@ -130,7 +134,9 @@ class CanonicalCamera(SampleTransform):
         return self._resize_sample(sample, batch, change.inverse())
 
     if TYPE_CHECKING:
-        __call__ = forward  # nn.Module's has no types
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def _scale_sample(self, sample: Sample, batch: Batch, scale: Tensor) -> Sample:
         """Return the sample with every length of the camera's frame multiplied by `scale` (B,)."""

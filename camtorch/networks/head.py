@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Collection, Sequence
 from contextlib import nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +17,7 @@ from camtorch.networks.limits import Limits
 from camtorch.networks.prior import prior_of
 from camtorch.optics.radial_inverse import precise
 from camtorch.values.arguments import as_coordinates, as_flag, as_image_size, as_number, as_whole
-from camtorch.values.module import GeometryModule
+from camtorch.values.module import GeometryModule, typed_as
 
 _ASPECT = 0.1
 _LARGEST = 1e6  # a number whose square is finite, and whose gradient is negligible
@@ -65,6 +65,13 @@ class CameraHead(GeometryModule):
         (torch.Size([8]), 85)
     """
 
+    model: type[Camera]
+    image_size: tuple[int, int]
+    centre: float
+    shared_focal: bool
+    names: tuple[str, ...]
+    linear: nn.Linear
+
     def __init__(
         self,
         features: int,
@@ -101,7 +108,7 @@ class CameraHead(GeometryModule):
         # numbers without effect, like the angles of a table, cannot be learnt
         self._coefficients = [i for i, moves in enumerate((scales > 0).all(0).tolist()) if moves and free[4 + i]]
         self._centres = [i for i in range(2) if free[2 + i] and centre > 0]
-        self.names: tuple[str, ...] = (
+        self.names = (
             "focal",
             *(() if shared_focal else ("aspect",)),
             *(("cx", "cy")[i] for i in self._centres),
@@ -136,7 +143,9 @@ class CameraHead(GeometryModule):
             return self.camera(self.linear(features.to(self.linear.weight.dtype)))
 
     if TYPE_CHECKING:
-        __call__ = forward  # nn.Module's has no types
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def camera(self, numbers: Tensor) -> Camera:
         """Return cameras (*B) for numbers (*B, n) in the order of `names`, for use with your own layer.

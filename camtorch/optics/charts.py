@@ -171,6 +171,8 @@ class EquidistantUpTo(Equidistant):
 
     code: ClassVar[int | None] = EQUIDISTANT
 
+    last: Tensor
+
     def __init__(self, last: Tensor):
         self.last = last.detach()
 

@@ -41,6 +41,10 @@ def newton_step(jacobian: Jacobian, du: Tensor, dv: Tensor) -> Planes3:
 class StageAt:
     """A stage at points (a, b)."""
 
+    stage: Stage
+    a: Tensor
+    b: Tensor
+
     def __init__(self, stage: Stage, a: Tensor, b: Tensor):
         self.stage, self.a, self.b = stage, a, b
 
@@ -351,13 +355,17 @@ class Shear(Stage):
 class Lens:
     """A chain of stages, the first of which sits on the chart's plane; no stages make the identity."""
 
+    is_radial: bool
+    radial: RadialFactor | None
+    rest: Lens | None
+
     def __init__(self, *stages: Stage):
         self.stages = stages
-        self.is_radial: bool = len(stages) == 1 and stages[0].is_radial
+        self.is_radial = len(stages) == 1 and stages[0].is_radial
         """Whether the lens is a single radial factor, so that its inverse has one variable."""
-        self.radial: RadialFactor | None = stages[0].radial if stages else None
+        self.radial = stages[0].radial if stages else None
         """The radial factor of the first stage, if it has one."""
-        self.rest: Lens | None = Lens(*stages[1:]) if self.radial and stages[0].is_radial and len(stages) > 1 else None
+        self.rest = Lens(*stages[1:]) if self.radial and stages[0].is_radial and len(stages) > 1 else None
         """The stages after a first one that is a radial factor alone, if there are such."""
 
     @property

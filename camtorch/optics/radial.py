@@ -109,6 +109,9 @@ class Rational(RadialFactor):
 
     code: ClassVar[int | None] = RATIONAL
 
+    numerator: Polynomial
+    denominator: Polynomial
+
     def __init__(self, numerator: Sequence[Tensor], denominator: Sequence[Tensor]):
         self.numerator, self.denominator = Polynomial(numerator), Polynomial(denominator)
         self.parameters: tuple[Tensor, ...] = *self.numerator.parameters, *self.denominator.parameters
@@ -149,6 +152,8 @@ class RadiusPolynomial(RadialFactor):
     """
 
     code: ClassVar[int | None] = RADIUS_POLYNOMIAL
+
+    of_radius: Polynomial
 
     def __init__(self, coefficients: Sequence[Tensor]):
         self.of_radius = Polynomial(coefficients)
@@ -213,6 +218,10 @@ class RadiusTable(RadialFactor):
     """
 
     code: ClassVar[int | None] = RADIUS_TABLE
+
+    nodes: tuple[Tensor, ...]
+    end: Tensor
+    cubics: tuple[tuple[Tensor, ...], ...]
 
     def __init__(self, nodes: Sequence[Tensor], values: Sequence[Tensor]):
         """Fit the spline to at least two `nodes`, ascending radii, and the `values` of r there."""

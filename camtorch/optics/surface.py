@@ -103,6 +103,13 @@ class Surface(Stage):
     code: ClassVar[int | None] = SURFACE
     _at = SurfaceAt
 
+    columns: int
+    rows: int
+    order: int
+    cells: tuple[float, float]
+    centre: tuple[float, float]
+    behind: float
+
     def __init__(
         self,
         controls: Sequence[Tensor],

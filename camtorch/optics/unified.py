@@ -24,6 +24,10 @@ class Unified(Chart):
 
     code: ClassVar[int | None] = UNIFIED
 
+    fixed_alpha: float | None
+    has_xi: bool
+    has_beta: bool
+
     def __init__(self, xi: Tensor | None = None, alpha: Tensor | float = 0.0, beta: Tensor | None = None):
         self.fixed_alpha = alpha if isinstance(alpha, float) else None
         self.has_xi, self.has_beta = xi is not None, beta is not None

@@ -25,7 +25,7 @@ from camtorch.values.arguments import (
     hinting,
     shown,
 )
-from camtorch.values.module import BatchedModule, remade
+from camtorch.values.module import BatchedModule, remade, typed_as
 
 
 class Extrinsics(BatchedModule):
@@ -92,7 +92,9 @@ class Extrinsics(BatchedModule):
         return restore(turned + translation.mT.unsqueeze(-1))
 
     if TYPE_CHECKING:
-        __call__ = forward  # nn.Module's has no types
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def matrix(self) -> Tensor:
         """Return the matrices (*B, 4, 4) [[R, t], [0, 1]]."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +17,7 @@ from camtorch.models import Cylindrical, Equirectangular, LatLon, Pinhole, Trans
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, skew_matrix
 from camtorch.values.arguments import Numbers, as_flag, as_fov, as_image_size, as_values, hinting, one_of
-from camtorch.values.module import GeometryModule
+from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.arrays import Image
 from camtorch.warp.dewarp import middle_lines
 from camtorch.warp.reproject import check_pose
@@ -115,7 +115,9 @@ class Rectification(GeometryModule):
         return to_left(left), to_right(right)
 
     if TYPE_CHECKING:
-        __call__ = forward  # nn.Module's has no types
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def disparity_to_points(self, disparity: Numbers, valid: Numbers | None = None) -> tuple[Tensor, Tensor]:
         """Return the points of the scene for disparities, in the frame of the rectified left camera.

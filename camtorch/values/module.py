@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +15,15 @@ from camtorch.evaluate.door import outside_inference
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import is_kept
 from camtorch.values.arguments import LEFT, shown
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def typed_as(forward: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, R]]:
+    """Give a `__call__` the signature of `forward` for type checkers, as nn.Module's has none."""
+    return lambda call: call
+
 
 _BARE = nn.Module().__dict__
 _KINDS = {"_own": dict, **{name: type(value) for name, value in _BARE.items() if isinstance(value, (dict, set))}}

@@ -47,6 +47,7 @@ class PlaneWarp(Warp):
     """
 
     is_an_operator = False
+    batch_shape: torch.Size
     normal: Tensor
     distance: Tensor
 
@@ -166,6 +167,10 @@ class BirdsEye(PlaneWarp):
         ValueError: If the camera is not above the ground, a range does not ascend, or the resolution is not positive;
             and as `Warp`. TypeError: If camera is no Camera, or extrinsics are no Extrinsics.
     """
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    resolution: float
 
     def __init__(
         self,

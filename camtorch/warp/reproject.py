@@ -50,6 +50,13 @@ class Reproject(GeometryModule):
         TypeError: If a camera is no Camera, or extrinsics are no Extrinsics.
     """
 
+    source: Camera
+    target: Camera
+    batch_shape: torch.Size
+    mode: Mode
+    padding_mode: PaddingMode
+    fill: tuple[float, ...]
+
     def __init__(
         self,
         source: Camera,
@@ -115,7 +122,7 @@ class Reproject(GeometryModule):
         return result.unflatten(2, (steps, -1)), valid
 
     if TYPE_CHECKING:
-        __call__ = forward  # nn.Module's has no types
+        __call__ = forward
 
     def _seen(self, depth: Tensor, kind: str) -> tuple[Tensor, Tensor]:
         """Return source pixels (B, D, H', W', 2), and whether they are valid."""

@@ -66,6 +66,8 @@ class RollingShutter(GeometryModule):
 
     readout: Tensor
     rates: Tensor
+    direction: Direction
+    batch_shape: torch.Size
 
     def __init__(self, readout: Numbers, rates: Numbers, *, direction: Direction = "down"):
         super().__init__()

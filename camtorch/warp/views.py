@@ -27,7 +27,7 @@ from camtorch.values.arguments import (
     shown,
 )
 from camtorch.values.dtypes import check_averaged, narrow, widen
-from camtorch.values.module import GeometryModule, remade
+from camtorch.values.module import GeometryModule, remade, typed_as
 from camtorch.warp.boxes import corners_of
 from camtorch.warp.crops import CropsWarp, flattened
 from camtorch.warp.sampling import Mode
@@ -54,6 +54,12 @@ class Views(GeometryModule):
     """
 
     rotations: Tensor
+    camera: Camera
+    view: Pinhole
+    names: tuple[str, ...]
+    mode: Mode
+    warps: nn.ModuleList
+    backs: nn.ModuleList
 
     def __init__(
         self, camera: Camera, view: Pinhole, rotations: Tensor, names: tuple[str, ...], mode: Mode = "bilinear"
@@ -79,7 +85,9 @@ class Views(GeometryModule):
         return np.stack(views, int(images.ndim == 4)) if isinstance(images, np.ndarray) else views
 
     if TYPE_CHECKING:
-        __call__ = forward  # nn.Module's has no types
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def valid_masks(self) -> Tensor:
         """Return (1, N, 1, S, S) bool: whether the camera sees each pixel of the views."""

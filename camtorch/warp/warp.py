@@ -83,6 +83,11 @@ class Warp(CameraPair):
     """
 
     _decides = False  # True: the warp itself chooses which images to antialias
+    batch_shape: torch.Size
+    mode: Mode
+    padding_mode: PaddingMode
+    fill: tuple[float, ...]
+    antialias: bool
     _has_shutters: ClassVar[bool] = False
 
     def __init__(
@@ -165,7 +170,7 @@ class Warp(CameraPair):
         return self.warped(images.flatten(1, -3), sampler._replace(fill=each)).unflatten(1, images.shape[1:-2])
 
     if TYPE_CHECKING:
-        __call__ = forward  # nn.Module's has no types
+        __call__ = forward
 
     def strips(
         self,
