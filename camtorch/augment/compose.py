@@ -132,9 +132,11 @@ class Compose(Augmentation):
             if part.mirroring is not None:
                 part.mirroring = value
 
-    needs_camera = _of_parts(any, "needs_camera", "Whether a part does.")
-    place = _of_parts(any, "place", "Whether a part adds `crop_place`: of the new image, seen from the first camera.")
-    drawn_on_host = _of_parts(all, "drawn_on_host", "See `Augmentation`; whether all parts are.")
+    needs_camera: bool = _of_parts(any, "needs_camera", "Whether a part does.")
+    place: bool = _of_parts(
+        any, "place", "Whether a part adds `crop_place`: of the new image, seen from the first camera."
+    )
+    drawn_on_host: bool = _of_parts(all, "drawn_on_host", "See `Augmentation`; whether all parts are.")
 
     @property
     def makes_pinholes(self) -> bool:  # type: ignore[override]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from camtorch.poses.rotations import rotation_matrix, turn
 from camtorch.rays.depth import as_depth, depth_scale
 from camtorch.values.arguments import Numbers, as_batch, check_devices, shown
 from camtorch.values.dtypes import check_averaged
-from camtorch.values.module import GeometryModule
+from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.grid import Sampling, to_positions
 from camtorch.warp.panorama import off_poles, seam_of
 from camtorch.warp.sampling import Fill, Mode, PaddingMode, as_options, render
@@ -122,7 +122,9 @@ class Reproject(GeometryModule):
         return result.unflatten(2, (steps, -1)), valid
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def _seen(self, depth: Tensor, kind: str) -> tuple[Tensor, Tensor]:
         """Return source pixels (B, D, H', W', 2), and whether they are valid."""

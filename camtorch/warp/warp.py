@@ -25,6 +25,7 @@ from camtorch.values.arguments import (
     one_of,
 )
 from camtorch.values.dtypes import check_averaged
+from camtorch.values.module import typed_as
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
 from camtorch.warp.plan import CameraPair, WarpPlan
@@ -170,7 +171,9 @@ class Warp(CameraPair):
         return self.warped(images.flatten(1, -3), sampler._replace(fill=each)).unflatten(1, images.shape[1:-2])
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        @typed_as(forward)
+        def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def strips(
         self,
