@@ -27,6 +27,7 @@ Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Pixels (h, w, 2) for every camera, or (B, h, w, 2) for each its own, to positions (B or 1, h, w, 2) as of
 `grid_sample`, `OUTSIDE` where no ray is mapped, and bool (B or 1, h, w): whether one is."""
 
+_MISSED_BY_QUINTICS = 5.5 * 5 / 1024  # of sixth differences: their largest error, also where third derivatives step
 _PROBES = ((4, 0), (0, 4), (8, 4), (4, 8), (4, 4))  # across and down: the middles of a cell's sides, and its own
 _MIDDLE = {4: (0.0, -1 / 16, 9 / 16, 9 / 16, -1 / 16, 0.0), 6: tuple(w / 256 for w in (3, -25, 150, 150, -25, 3))}
 """Weights of six nodes in the middle of a cubic through four of them, and of a quintic."""
@@ -69,6 +70,16 @@ def classify(
     camera, place = (rim != (flat[:, at] != CELL_EMPTY)).nonzero(as_tuple=True)
     flat[camera, at[place]] = CELL_TODO
     return cells
+
+
+def are_smooth(nodes: Tensor, source: tuple[int, int], tolerance: float) -> bool:
+    """Whether quintics keep the tolerance in every cell, of nodes (B, 2, n + 7, m + 7) which are all mapped."""
+    # the largest at a cell's corners, and at the next ones on either side
+    across = F.max_pool2d(nodes[:, :, 2:-2].diff(6, dim=3).abs(), (4, 2), 1)
+    down = F.max_pool2d(nodes[..., 2:-2].diff(6, dim=2).abs(), (2, 4), 1)
+    limit = 2 * tolerance / _MISSED_BY_QUINTICS
+    missed = (across + down) * nodes.new_tensor(source[::-1])[:, None, None]
+    return bool((missed.square().sum(1) <= limit * limit).all())
 
 
 def settle(

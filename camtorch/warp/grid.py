@@ -26,13 +26,13 @@ from camtorch.poses.rotations import turn
 from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.native_calls import NativeMove
 from camtorch.values.threads import on_one_thread
-from camtorch.warp.cells import Exact, classify, lay_quintics, places, prefer_quintics, put, settle
+from camtorch.warp.cells import Exact, are_smooth, classify, lay_quintics, places, prefer_quintics, put, settle
 from camtorch.warp.panorama import goes_round, lengths, off_poles, within_turn
 
 _STRIP = 1 << 19  # pixels
 FEWEST = 8  # cells along a side: with fewer, exact positions take less time than a lattice
 _BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
-_kept_weights = Kept(4)  # those of `_weights` on other devices, where each operator is a launch
+_kept_weights = Kept(4)  # those of `_weights`
 MOST_KEPT = 1 << 16  # nodes of a lattice whose pixels are kept for the next one
 
 
@@ -73,6 +73,7 @@ class Lattice:
     with a graph also `CELL_QUINTIC`, for quintics through six nodes, whose derivatives are as good as exact ones.
 
     done: (3, K) the cells of `exact`, in its order; None where `cells` may be looked at.
+    smooth: whether all cells are `CELL_QUINTIC`, as without the compiled library, to which none may be given.
     """
 
     nodes: Tensor
@@ -80,13 +81,14 @@ class Lattice:
     exact: Tensor
     size: tuple[int, int]
     done: Tensor | None = None
+    smooth: bool = False
 
     def on(self, device: torch.device) -> Lattice:
         """Send a lattice from the CPU to another device."""
         done = torch.stack((self.cells >= 0).nonzero(as_tuple=True))
         exact = self.exact[:, self.cells[tuple(done)].long()]
         nodes, cells, exact, done = sent([self.nodes, self.cells, exact, done], device)
-        return Lattice(nodes, cells, exact, self.size, done)
+        return Lattice(nodes, cells, exact, self.size, done, self.smooth)
 
     def cameras(self, rows: slice | Tensor) -> Lattice | Sampling:
         """Return the lattice of these cameras of the batch; on another device the positions of its pixels."""
@@ -109,6 +111,8 @@ class Lattice:
         """The positions of all pixels; torch.jit.trace records them as a constant, even if they are made there."""
         with set_aside() if in_jit_trace() else nullcontext():
             nodes, exact, cells = self.nodes, self.exact, self.cells
+            if self.smooth:
+                return Sampling(*_all_by_quintics(nodes, cells, self.size), None)
             single = nodes.dtype == torch.float32 and self.done is None
             if single and native_available() and is_eager(nodes, exact, cells):
                 grid, seen = _Pixels.apply(nodes, exact, cells, self.size)  # type: ignore[no-untyped-call]
@@ -138,6 +142,12 @@ class _Pixels(Function):
             grid, _ = _pixel_by_pixel(leaves[0], leaves[1], cells, ctx.size)
         by_nodes, by_exact = torch.autograd.grad(grid, leaves, by_grid, create_graph=True, materialize_grads=True)
         return by_nodes, by_exact, None, None
+
+
+def _all_by_quintics(nodes: Tensor, cells: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Return positions (B, h, w, 2) of a lattice's pixels by quintics alone, and that there are all of them."""
+    planes = interpolated(nodes, *cells.shape[1:])[:, :, : size[0], : size[1]]
+    return planes.movedim(1, -1), torch.ones_like(planes[:, 0], dtype=torch.bool)
 
 
 def _pixel_by_pixel(
@@ -350,15 +360,24 @@ def on_lattice(
     native = _move_back(source, target, rotation, like)
     if native is None and not are_free(like):
         return None
-    nodes, size = (n + 5) * (m + 5), source.size_for("Warp")
-    pixels = (kept_probes if nodes <= MOST_KEPT else kept_probes.__wrapped__)(rows, width, like.dtype)
+    # the library finds cubics for each cell; torch alone first looks one node further, whether quintics do everywhere
+    more = 5 if native is not None or learns or native_available() else 7
+    nodes, size = (n + more) * (m + more), source.size_for("Warp")
+    pixels = (kept_probes if nodes <= MOST_KEPT else kept_probes.__wrapped__)(rows, width, like.dtype, more)
     if native is not None:
         made = native.lattices(pixels, (height, width), rows.start, tolerance, padding, learns)
         return None if made is None else Lattice(*made, (height, width))
     exact = partial(_positions, source, target, rotation, None)
     positions, mapped = exact(pixels)  # (B, 1, N, 2)
-    lattice = positions[:, 0, :nodes].movedim(-1, 1).contiguous().unflatten(2, (n + 5, m + 5))
-    mapped, rim = mapped[:, 0, :nodes].unflatten(1, (n + 5, m + 5)), mapped[:, 0, nodes:]
+    lattice = positions[:, 0, :nodes].movedim(-1, 1).contiguous().unflatten(2, (n + more, m + more))
+    if more > 5:
+        is_smooth = bool(mapped.all()) and are_smooth(lattice, size, tolerance)
+        lattice = lattice[:, :, 1:-1, 1:-1].contiguous()
+        if is_smooth:
+            cells = torch.full((len(lattice), n, m), CELL_QUINTIC, dtype=torch.int32, device=like.device)
+            return Lattice(lattice, cells, like.new_empty(2, 0, STEP, STEP), (height, width), smooth=True)
+    mapped, rim = mapped[:, 0, :nodes].unflatten(1, (n + more, m + more)), mapped[:, 0, nodes:]
+    mapped = mapped[:, 1:-1, 1:-1].contiguous() if more > 5 else mapped
     find = sampler.classify if native_available() else classify
     narrow, limits = lattice.float(), (size, tolerance, padding)
     cells = find(narrow, mapped, rim, (height, width), *limits)
@@ -406,13 +425,16 @@ def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype
 
 
 @lru_cache(maxsize=8)
-def kept_probes(rows: range, width: int, dtype: torch.dtype) -> Tensor:
-    """Return the nodes of a lattice, and then the pixels at the rim of the target, (1, N, 2) on the CPU."""
+def kept_probes(rows: range, width: int, dtype: torch.dtype, more: int = 5) -> Tensor:
+    """Return the nodes of a lattice, and then the pixels at the rim of the target, (1, N, 2) on the CPU.
+
+    more: how many more nodes than cells there are along an axis.
+    """
     with torch.inference_mode(False):
         down, across = (torch.arange(length, dtype=dtype, device="cpu") for length in (len(rows), width))
         # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
         v, u = (
-            (torch.arange(math.ceil(side / STEP) + 5, dtype=dtype, device="cpu") - 2) * STEP
+            (torch.arange(math.ceil(side / STEP) + more, dtype=dtype, device="cpu") - more // 2) * STEP
             for side in (len(rows), width)
         )
         nodes = torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"))
@@ -455,7 +477,8 @@ def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
     wide = nodes.dtype if torch.get_float32_matmul_precision() == "highest" else torch.float64
     taps = nodes.shape[2] - rows + 1
     form = taps, nodes.dtype, wide, nodes.device
-    weights, spread = _weights(*form) if nodes.is_cpu else _kept_weights((), form, lambda: _weights(*form))
+    is_kept = not nodes.is_cpu or is_eager(nodes)
+    weights, spread = _kept_weights((), form, lambda: _weights(*form)) if is_kept else _weights(*form)
     terms = (nodes[:, :, i : i + rows, None] * weights[:, i, None] for i in range(taps))
     lines = reduce(torch.add, terms).flatten(0, 3).to(wide)
     result = lines.new_empty(len(lines), columns * STEP)

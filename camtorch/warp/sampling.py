@@ -75,6 +75,7 @@ def prepared(images: Tensor, where: Sampling | Lattice, how: Sampler, out: Tenso
     None with a graph, a transform, another device or dtype, or antialiasing.
     """
     mode, padding_mode, fill = how
+    where = where.pixels if isinstance(where, Lattice) and where.smooth else where
     positions = where.nodes if isinstance(where, Lattice) else where.grid
     if not is_eager(images, positions):
         return None

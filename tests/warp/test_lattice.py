@@ -94,6 +94,7 @@ def test_torch_doubts_the_cells_that_compiled_code_doubts(key, monkeypatch):
                 patch.setattr(grid, "native_available", lambda: False)
                 patch.setattr(grid, "_move_back", lambda *_: None)
                 patch.setattr(grid, "classify", both)
+                patch.setattr(grid, "are_smooth", lambda *_: False)
                 laid = grid.on_lattice(*given)
             if compiled is not None and laid is not None:
                 assert torch.equal(compiled.pixels.mapped, laid.pixels.mapped)
