@@ -10,14 +10,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Change, LazyWarp
+from camtorch.augment.change import Change, LazyWarp, Part
 from camtorch.augment.fields import KINDS, field_of, in_range
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.tensors import are_numbers
+from camtorch.evaluate.tensors import are_numbers, known_true
+from camtorch.native.library import native_available
+from camtorch.native.structs import EDGE_POINTS
 from camtorch.values.threads import thread_count
+from camtorch.warp.affine import MirrorWarp
+from camtorch.warp.boxes import along_edges, around, corners_of, in_order
 from camtorch.warp.samples import Label, call_for
 from camtorch.warp.sampling import Options, Sampler
+from camtorch.warp.warp import Warp
 
 MovedField = tuple[Tensor, Tensor | None]
 """A field of a sample as it comes out, and which of it is valid, if it has validity."""
@@ -48,6 +53,8 @@ class SamplePlan:
         moves, calls = part.moves, self.calls
         if calls is None or moves is None or part.rows is not None or change.gate is not None or not self.count:
             return {}
+        if not native_available():
+            return self._pixels_at_once(part, values)
         if (natives := part.natives()) is None:
             return {}
         source, target, rotation = natives
@@ -71,6 +78,32 @@ class SamplePlan:
             if result is not None:
                 (rows, valid), dtype = result, values[name].dtype
                 results[name] = rows if rows.dtype == dtype else in_range(rows, dtype), valid
+        return results
+
+    def _pixels_at_once(self, part: Part, values: Mapping[str, Any]) -> dict[str, MovedField]:
+        """Move pixels and boxes by one evaluation of the cameras, of which torch makes hundreds of operations."""
+        warp, dtype = part.warp, part.camera.intrinsics.dtype
+        given, outlines = dict[str, Tensor](), list[Tensor]()
+        for name, kind in self.fields.items():
+            value = values[name]
+            if isinstance(value, list) or value.dtype != dtype or value.ndim - self.batched > KINDS[kind].most_dims:
+                continue
+            way = field_of(kind, value).way
+            if way == "pixels" or (way == "boxes" and known_true(in_order(value).all())):
+                given[name] = rows = self.rows(value)
+                outlines.append(rows if way == "pixels" else along_edges(corners_of(rows), EDGE_POINTS))
+        if len(given) < 2 or type(warp) not in (Warp, MirrorWarp):  # others move points by more than their cameras
+            return {}
+        moved, mapped = warp.move(torch.cat([outline.flatten(1, -2) for outline in outlines], 1))
+        counts, results = [outline.shape[1:-1].numel() for outline in outlines], dict[str, MovedField]()
+        pairs = zip(moved.split(counts, 1), mapped.split(counts, 1), strict=True)
+        for (name, rows), outline, pair in zip(given.items(), outlines, pairs, strict=True):
+            places, seen = pair[0].reshape(outline.shape), pair[1].reshape(outline.shape[:-1])
+            if outline is rows:
+                seen = seen & warp.target.contains(places)
+            else:
+                places, seen = around(warp, corners_of(rows), places, seen)
+            results[name] = (places, seen) if self.batched else (places.squeeze(0), seen.squeeze(0))
         return results
 
     def _ways(

@@ -35,8 +35,12 @@ def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
     corners = as_coordinates(corners, "corners", 2, "Warp", warp.source.intrinsics.device, "B, *N, K")
     if corners.ndim < 2:
         raise ValueError(f"Warp: corners must be (B, *N, K, 2); got shape {tuple(corners.shape)}")
+    return around(warp, corners, *warp.move(along_edges(corners, EDGE_POINTS)))
+
+
+def around(warp: CameraPair, corners: Tensor, moved: Tensor, mapped: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the boxes that enclose polygons, of which a warp has moved the points along their edges."""
     finite = torch.isfinite(corners).flatten(-2).all(-1, keepdim=True)
-    moved, mapped = warp.move(along_edges(corners, EDGE_POINTS))
     mapped = mapped & finite
     low = torch.where(mapped.unsqueeze(-1), moved, torch.inf).amin(-2)
     high = torch.where(mapped.unsqueeze(-1), moved, -torch.inf).amax(-2)

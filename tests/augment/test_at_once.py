@@ -58,6 +58,7 @@ def sample_for(dtype):
     return {"image": image, "mask": mask, "keypoints": pixels, "polygons": pixels.view(3, 3, 2)}
 
 
+ROUNDED = 0 if native_available() else 1e-4  # torch moves all pixels at once, and rounds the last ones differently
 CASES, FEW = list(product(LENSES, AUGMENTATIONS, DTYPES)), {"mount", "chain", "edits"}
 
 
@@ -73,7 +74,7 @@ def test_as_step_by_step(key, name, dtype):
         assert torch.equal(out["mask"], change.labels(sample["mask"][None, None], fill)[0, 0])
         for field in ("keypoints", "polygons"):
             moved, valid = change.points(sample[field][None])
-            torch.testing.assert_close(out[field], moved[0], rtol=0, atol=0)
+            torch.testing.assert_close(out[field], moved[0], rtol=0, atol=ROUNDED)
             assert torch.equal(out[f"{field}_valid"], valid[0])
         assert torch.equal(out["rotation"], change.rotation[0])
         assert torch.equal(out["camera"].intrinsics, change.target.intrinsics[0])
@@ -97,7 +98,7 @@ def test_batches_as_step_by_step(key, name, threads):
     change = augment.last
     assert torch.equal(out["image"], change.images(sample["image"]))
     assert torch.equal(out["mask"], change.labels(sample["mask"][:, None], augment.mask_fill)[:, 0])
-    assert torch.equal(out["keypoints"], change.points(sample["keypoints"])[0])
+    torch.testing.assert_close(out["keypoints"], change.points(sample["keypoints"])[0], rtol=0, atol=ROUNDED)
 
 
 LAST = {
