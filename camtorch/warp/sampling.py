@@ -151,8 +151,10 @@ def _by_torch(images: Tensor, where: Sampling, how: Sampler, kept: dict[int, Pyr
         rows = max(_STRIP // max(math.prod(images.shape[:2]) * width, 1), 1)
         for top in range(0, height, rows):
             here = where.part(slice(top, top + rows))
-            made = _render(levels.images, here.grid, here, levels, how)
-            result[:, :, top : top + rows] = narrow(made, dtype)
+            made = narrow(_render(levels.images, here.grid, here, levels, how), dtype)
+            # channel by channel: channels that are last in memory would be copied pixel by pixel
+            for plane, channel in zip(result[:, :, top : top + rows].unbind(1), made.unbind(1), strict=True):
+                plane.copy_(channel)
         return result
     result = images.new_empty(*images.shape[:2], *where.grid.shape[1:3])
     for i in range(0, count, step):
