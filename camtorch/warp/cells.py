@@ -75,11 +75,20 @@ def classify(
 def are_smooth(nodes: Tensor, source: tuple[int, int], tolerance: float) -> bool:
     """Whether quintics keep the tolerance in every cell, of nodes (B, 2, n + 7, m + 7) which are all mapped."""
     # the largest at a cell's corners, and at the next ones on either side
-    across = F.max_pool2d(nodes[:, :, 2:-2].diff(6, dim=3).abs(), (4, 2), 1)
-    down = F.max_pool2d(nodes[..., 2:-2].diff(6, dim=2).abs(), (2, 4), 1)
+    across = _largest(nodes[:, :, 2:-2].diff(6, dim=3).abs(), 4, 2)
+    down = _largest(nodes[..., 2:-2].diff(6, dim=2).abs(), 2, 4)
     limit = 2 * tolerance / _MISSED_BY_QUINTICS
     missed = (across + down) * nodes.new_tensor(source[::-1])[:, None, None]
     return bool((missed.square().sum(1) <= limit * limit).all())
+
+
+def _largest(values: Tensor, rows: int, columns: int) -> Tensor:
+    """Return the largest of each 2 or 4 rows and columns, in much less time than by `max_pool2d`."""
+    for dim, count in ((3, columns), (2, rows)):
+        for step in (1, 2)[: count // 2]:
+            rest = values.shape[dim] - step
+            values = torch.maximum(values.narrow(dim, step, rest), values.narrow(dim, 0, rest))
+    return values
 
 
 def settle(
