@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial, reduce
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -15,19 +15,32 @@ from torch import Tensor
 from torch.autograd import Function
 
 from camtorch.cameras.camera import Camera
+from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.devices import sent
 from camtorch.evaluate.door import in_jit_trace, is_eager, keeps_graph, may_look, set_aside
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_free, are_plain, is_unknown
 from camtorch.native import sampler
 from camtorch.native.library import native_available
-from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_QUINTIC, CELL_TODO, FAR, OUTSIDE, POSITIONS, STEP
+from camtorch.native.structs import (
+    CELL_CUBIC,
+    CELL_EMPTY,
+    CELL_QUINTIC,
+    CELL_TODO,
+    FAR,
+    OUTSIDE,
+    POSITIONS,
+    RADIUS_TABLE,
+    STEP,
+    SURFACE,
+)
 from camtorch.poses.rotations import turn
 from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.native_calls import NativeMove
+from camtorch.values.arguments import columns
 from camtorch.values.threads import on_one_thread
 from camtorch.warp.cells import Exact, are_smooth, classify, lay_quintics, places, prefer_quintics, put, settle
-from camtorch.warp.panorama import goes_round, lengths, off_poles, within_turn
+from camtorch.warp.panorama import goes_round, lengths, off_poles, seam_of, within_turn
 
 _STRIP = 1 << 19  # pixels
 FEWEST = 8  # cells along a side: with fewer, exact positions take less time than a lattice
@@ -344,11 +357,14 @@ def on_lattice(
     image that the padding does not need keep no tolerance; for "reflection" all do.
 
     If a camera or the rotation learns, its nodes and exact cells are computed again, with a graph. For this `learns`
-    leaves cells that quintics do for `CELL_QUINTIC`, and more than a fifth exact ones are too many.
+    leaves cells that quintics do for `CELL_QUINTIC`, and more than a fifth exact ones are too many. None if derivatives
+    may bend where positions do not: by coefficients that shape a part of the image each, and by the focal length of a
+    target that begins again after a whole turn.
     """
     tensors = [*source.tensors, *target.tensors, *(() if rotation is None else (rotation,))]
     if keeps_graph(*tensors):
-        if not is_eager(*tensors):
+        turns = seam_of(target) is not None and target.intrinsics.requires_grad
+        if not is_eager(*tensors) or turns or any(map(_learns_by_parts, (source, target))):
             return None
         with torch.no_grad():  # a quarter: errors of positions are larger in derivatives than in images
             found = on_lattice(source, target, rotation, tolerance / 4, rows, padding, learns=True)
@@ -388,6 +404,21 @@ def on_lattice(
     if not learns:
         computed = torch.cat((computed, lay_quintics(lattice, cells, computed.shape[1])), 1)
     return Lattice(lattice, cells, computed, (height, width))
+
+
+def _learns_by_parts(camera: Camera) -> bool:
+    """Whether coefficients learn that may shape parts of the image, narrower than cells."""
+    members = cast("Iterable[Camera]", camera.cameras) if isinstance(camera, Mixed) else (camera,)
+    models: list[Any] = [(type(member), member.distortion) for member in members]
+    return any(k.requires_grad and _has_parts(model, k.shape[-1]) for model, k in models)
+
+
+@lru_cache(maxsize=64)
+def _has_parts(model: type[Camera], count: int) -> bool:
+    """Whether that many coefficients are those of a table or of a surface, or of a formula that is not ours."""
+    _, lens = model.optics(columns(torch.tensor([model.ideal(count)], dtype=torch.float64, device="cpu")))
+    parts = [*lens.stages, *(stage.radial for stage in lens.stages if stage.radial)]
+    return any(vars(type(part)).get("code") in (None, RADIUS_TABLE, SURFACE) for part in parts)
 
 
 def _with_graph(

@@ -155,13 +155,13 @@ def test_gradients_are_those_of_exact_positions(key):
 @pytest.mark.usefixtures("way")
 def test_gradients_of_pieces_narrower_than_cells_are_exact():
     """A piece bends what it shapes also where all of them together are smooth."""
-    angles = torch.linspace(0.0, 1.3, 31)[1:]
-    numbers = torch.tensor([70.0, 72.0, 80.3, 59.1])
-    table = ct.Tabulated(numbers, torch.cat((angles, angles)), image_size=(120, 160))
-    surface = ct.Splined.with_grid(columns=30, rows=20, fov_x=100)(numbers, image_size=(120, 160))
-    check_both_ways(table)
-    check_both_ways(surface)
-    check_both_ways(ct.Mixed([table, surface]))
+    angles = torch.linspace(0.0, 1.3, 65)[1:]
+    numbers, size = torch.tensor([280.0, 288.0, 320.3, 239.1]), (480, 640)
+    table = ct.Tabulated(numbers, torch.cat((angles, angles)), image_size=size)
+    surface = ct.Splined.with_grid(columns=30, rows=20, fov_x=100)(numbers, image_size=size)
+    pinhole = ct.Pinhole(numbers, image_size=size).requires_grad_(False)
+    for camera in (table, surface, ct.Mixed([table, surface])):
+        check_numbers(learning := camera.resize(*size).requires_grad_(), learning, pinhole)
 
 
 @pytest.mark.usefixtures("way")
