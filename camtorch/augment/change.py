@@ -525,7 +525,10 @@ def _distance(warp: Warp, distance: Tensor) -> Tensor:
 def by_kinds(
     count: int, camera: Camera, part: Callable[[list[int] | None, Camera], Part], gate: Tensor | None = None
 ) -> Change:
-    """Return the change of samples by cameras: `part` takes the rows, None for all, and the cameras of each kind."""
+    """Return the change of `count` samples, with one part for each camera model of the batch.
+
+    `part` is called with the rows of a model's samples, None for all, and with their cameras.
+    """
     camera = one_or_batch(camera)
     if not isinstance(camera, Mixed):
         return Change(count, [part(None, camera)], gate=gate)

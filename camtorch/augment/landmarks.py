@@ -147,7 +147,10 @@ class Mirroring:
         self.key = self._named, self._one, self.lateral, self.swap_sides  # equal for equal effects
 
     def order(self, name: str, kind: str | None, count: int) -> tuple[int, ...] | None:
-        """Return the order of `count` landmarks of a field in a mirror, or None; a path may precede its name."""
+        """Return the order in which a field's `count` landmarks come out of a mirror, or None to keep theirs.
+
+        The field's `name` may have a path of keys before it, divided by slashes.
+        """
         table = self._named.get(name.rpartition("/")[2]) if self._named is not None else self._one
         if table is None or count == 0:
             meant = _FACES.get(count) if self._named is None and kind in _PIXELS else None

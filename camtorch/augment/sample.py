@@ -367,7 +367,7 @@ class SampleTransform(KeepsCamera, nn.Module):
 
 
 def camera_of_images(named: Named, guess: Guess | None, is_needed: bool, owner: str) -> Camera:
-    """Return the camera of a sample that has none, nor the augmentation: by K, guessed, or unknown."""
+    """Return a camera if neither the sample nor the augmentation has one: from the sample's K, guessed, or unknown."""
     how = f"give one as sample['camera'] or {owner}(camera=...)"
     matrix = next(((name, value) for name, (kind, value) in named.items() if kind == "K"), None)
     if is_needed and guess is None and matrix is None:

@@ -34,7 +34,7 @@ class Observations(NamedTuple):
 
     @property
     def valid(self) -> Tensor:
-        """Whether there are both, bool (C, N)."""
+        """Whether a row has both a ray and its pixel, bool (C, N)."""
         return self.weights > 0
 
     @property

@@ -75,8 +75,8 @@ def from_insightface(faces: Any) -> Sample:
 def from_ultralytics(results: Any) -> Sample:
     """Return the people or faces that an Ultralytics model found in one image.
 
-    For a mirror of the keypoints of a person: `landmarks="coco17"`. Ultralytics counts from the edge of the image, so
-    half a pixel is taken off. All comes out on the CPU.
+    To mirror the keypoints of a person, pass `landmarks="coco17"` to `HorizontalFlip`. Ultralytics counts from the edge
+    of the image, so half a pixel is subtracted. All tensors are on the CPU.
 
     Args:
         results: The `Results` of one image, or the list of one that `model(image)` returns.
@@ -104,8 +104,8 @@ def from_ultralytics(results: Any) -> Sample:
 def from_dlib(shapes: Any) -> Sample:
     """Return the faces of dlib's `shape_predictor`.
 
-    For a mirror of its 68 landmarks: `landmarks="ibug68"`. dlib counts from the middle of the first pixel, as camtorch
-    does.
+    To mirror its 68 landmarks, pass `landmarks="ibug68"` to `HorizontalFlip`. dlib counts from the middle of the first
+    pixel, as camtorch does.
 
     Args:
         shapes: A list of `full_object_detection`, or one.

@@ -103,7 +103,7 @@ def same(tensor: Tensor, noted: Note) -> bool:
 
 
 def mark(tensor: Tensor) -> tuple[Any, ...]:
-    """Return where values lie, on another device, and how often they were changed in place."""
+    """Return the place of a tensor's values in its device's memory, and how often they were changed in place."""
     # dims of size one differ without a reason: a camera's numbers come as (n,) and as (1, n)
     steps = tuple(pair for pair in zip(tensor.shape, tensor.stride(), strict=True) if pair[0] != 1)
     return tensor.untyped_storage().data_ptr(), tensor.storage_offset(), tensor._version, steps

@@ -55,7 +55,7 @@ class Table(MapFormat):
 
     @abstractmethod
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        """Return the file of a mesh, and the facts that its user needs in addition to step and number of nodes."""
+        """Return the bytes of a mesh's file, and what its description needs in addition to step and number of nodes."""
 
     @abstractmethod
     def unpack(self, content: bytes, blank: Mesh) -> Floats:

@@ -68,9 +68,9 @@ def library() -> Library | None:
 
 
 def warn_if_missing() -> None:
-    """Warn, once a process, that long work is done without the library, unless CAMTORCH_NATIVE=0 says so.
+    """Warn, once a process, that long work is done without the library, unless CAMTORCH_NATIVE=0 turned it off.
 
-    Of a DataLoader's workers the first one warns.
+    In a DataLoader, only the first worker warns.
     """
     if _told or library() is not None or switched_off():
         return

@@ -21,7 +21,7 @@ back to the system, and a worker of a DataLoader spent a third of the time of a 
 
 
 def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> Tensor:
-    """Return `torch.empty` on the CPU, in memory of large pages that is not used again while anything on it lives."""
+    """Return an empty CPU tensor in memory of large pages, which later results use again once no tensor is on it."""
     size, strides = _place(shape, dtype, layout)
     block = _block(size)
     if block is None:

@@ -55,7 +55,7 @@ class CameraRows:
 
     @cached_property
     def domain(self) -> Domain:
-        """The domain of the lenses."""
+        """The domain in which the lenses are one-to-one; see `Domain`."""
         if self._host is not None and (native := self._host.native) is not None:
             return Domain(self.model.optics, self.k).found_elsewhere(native.lenses.tables())
         return domain_for(self.model, self.k, self._learns)

@@ -62,7 +62,7 @@ class MirrorWarp(Warp):
         self._halvings: list[int] | None = None
 
     def warped(self, images: Tensor, sampler: Sampler) -> Tensor:
-        """Return warped images, each row in its own way: images that shrink are resized or halved."""
+        """Return warped images; each one may be copied, resized, or halved and sampled, see `Way`."""
         smooth = sampler.mode != "nearest" and images.dtype != torch.bool
         called = torch.compiler.is_compiling() and not torch.onnx.is_in_onnx_export()
         if called and self._depends(smooth) and not keeps_graph(images, *self.tensors):

@@ -42,7 +42,7 @@ def classify(
     tolerance: float,
     padding: str,
 ) -> Tensor:
-    """Return the kinds of cells (B, n, m) int32 of a lattice; as `native.sampler.classify`, see there."""
+    """Return the kinds (B, n, m) int32 of a lattice's cells; `native.sampler.classify` explains kinds and arguments."""
     n, m = nodes.shape[-2] - 5, nodes.shape[-1] - 5
     half = nodes.new_tensor(source[::-1])[:, None, None] / 2
     across, down = nodes[:, :, 2:-2].diff(4).abs(), nodes[..., 2:-2].diff(4, dim=2).abs()
