@@ -310,7 +310,7 @@ class Change:
         return turns[0] if self._order is None else self._in_order(turns)
 
     def leads_to(self, camera: Camera | Sequence[Camera], rotation: Tensor | None = None) -> bool:
-        """Whether these may be the cameras after, by number, intrinsics and rotation, if values may be read."""
+        """Whether this change may end with `camera` and `rotation`: False if their values are known to differ."""
         pairs = [(self.target.intrinsics.reshape(-1, 4), one_or_batch(camera).intrinsics.reshape(-1, 4), 1e-8)]
         pairs += [] if rotation is None else [(self.rotation, rotation.reshape(-1, 3, 3), _HALF)]
         return all(

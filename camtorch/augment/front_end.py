@@ -39,7 +39,7 @@ def check_front_end(owner: str, augmentation: object, *kinds: type[SampleTransfo
 def check_single(
     owner: str, camera: Camera, sizes: Sequence[tuple[str, tuple[int, ...]]], hint: str = ""
 ) -> tuple[int, int]:
-    """Return the image_size of a single camera, which is that of images by name."""
+    """Return the image_size of a camera; raise if it has none or a batch, or if a named image differs from it."""
     if camera.image_size is None or camera.batch_shape:
         raise ValueError(
             f"{owner}: the camera must have an image_size and no batch dims; got image_size {camera.image_size} and "

@@ -34,7 +34,7 @@ class Outcome:
 
 
 def prepare(module: str) -> None:
-    """Import a module once for all later processes, while this process continues."""
+    """Start to import a module once for all later processes; this process does not wait for it."""
     if _HOW == "forkserver":
         from multiprocessing import forkserver
 

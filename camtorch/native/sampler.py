@@ -41,7 +41,7 @@ _WORTH = 8  # pixels that may be copied for one that is made: interpolated one b
 
 
 def takes(dtype: torch.dtype, mode: Mode) -> bool:
-    """Whether the library, if it is built, samples images of a dtype so."""
+    """Whether the library, if it is built, samples images of this dtype in this mode."""
     return (mode == "nearest" or dtype in _TYPES) and MODES[mode].code >= 0
 
 

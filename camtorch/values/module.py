@@ -250,7 +250,7 @@ class BatchedModule(GeometryModule):
             ) from None
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Self:
-        """Return this module with each of its tensors (*B, n) changed by the same function."""
+        """Return a new module like this one, with `change` applied to each of its tensors (*B, n)."""
         return remade(self, **{name: change(getattr(self, name)) for name in self.tensor_names})
 
     def to_dict(self) -> dict[str, Any]:

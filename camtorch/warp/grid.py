@@ -309,7 +309,7 @@ def _positions(
 
 
 def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return pixels (..., 2) of an image as sampling positions, in the same memory if there is no graph."""
+    """Return pixels (..., 2) of an image as positions for `grid_sample`; without a graph, `seen` is overwritten."""
     if may_look(seen) and are_plain(seen):
         for plane, side in zip(seen.unbind(-1), size[::-1], strict=True):
             plane.mul_(2 / side).add_(1 / side - 1)
