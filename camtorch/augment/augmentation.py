@@ -293,7 +293,7 @@ class Augmentation(SampleTransform):
         )
 
     def tell_of_empty_images(self, camera: Camera) -> None:
-        """Warn, once, if new images of such cameras will be mostly empty, as some draws of another generator show."""
+        """Warn, once, if new images of `camera` will be mostly empty; draws from a generator of its own show it."""
         if self.min_filled is not None or self._calls.warned or self.p == 0:
             return
         camera = camera[0] if camera.is_mixed else camera

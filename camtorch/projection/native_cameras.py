@@ -207,7 +207,7 @@ class Lenses:
         return struct.limits2, struct.extent
 
     def tables(self) -> dict[str, Tensor]:
-        """Return copies of all that `projection.domain.Domain` has of them by the same name, (C, n)."""
+        """Return copies (C, n) of the library's tables, by their names as attributes of `projection.domain.Domain`."""
         if self.plan.has_stages and self.plan.has_factor:
             self.inverse_table()
         if self.plan.has_stages and not self.plan.is_radial:

@@ -160,9 +160,10 @@ def prefer_quintics(nodes: Tensor, cells: Tensor, source: tuple[int, int], toler
 
 
 def places(todo: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the places (B, K) of the cells to do, True in (B, n, m); K is that of the camera with the most.
+    """Return the places (B, K) of the cells that are True in `todo` (B, n, m), and bool (B, K): which of them count.
 
-    And bool (B, K): which of them are to be done; cameras with fewer cells have others too, which do no harm.
+    K is the largest number of such cells of any camera. Cameras with fewer have places of other cells as well, which
+    do not count.
     """
     flat = todo.flatten(1)
     chosen = flat.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, : int(flat.sum(1).max())]
