@@ -46,7 +46,7 @@ def _blend(
         return far(*planes)
     large = far(*(p if w is None else torch.where(small, w, p) for w, p in zip(in_far, planes, strict=True)))
     if looks:  # mostly few are small
-        return large.index_put(places, near(*(p[places] for p in planes)))
+        return large.index_put(places, near(*(p.expand_as(small)[places] for p in planes)))
     return torch.where(small, near(*(torch.where(small, p, w) for w, p in zip(in_near, planes, strict=True))), large)
 
 

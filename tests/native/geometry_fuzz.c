@@ -112,11 +112,12 @@ static int moved(const Cameras *cameras, int64_t tile) {
         asked.padding = (int32_t)below(3), asked.cells = cells, asked.scratch = scratch;
         Job jobs[2] = {{0}};
         jobs[0].count = jobs[1].count = c, sampled = 0;
-        Lattices lattices = {move, asked, below(50), narrow, exact, &used, jobs, below(3)};
+        Lattices lattices = {move, asked, below(50), below(2), narrow, exact, &used, jobs, below(3)};
         const int64_t left = lattices_fuzzed(&lattices);
         fine &= left || sampled == c * lattices.job_count;
         fine &= used >= 0 && used <= c * rows * columns;
-        for (int64_t i = 0; !left && i < c * rows * columns; i++) fine &= cells[i] >= CELL_EMPTY && cells[i] < used;
+        for (int64_t i = 0; !left && i < c * rows * columns; i++)
+            fine &= (cells[i] >= CELL_EMPTY && cells[i] < used) || (lattices.learns && cells[i] == CELL_QUINTIC);
         free(cells), free(scratch), free(exact);
     }
     for (int64_t at = 0; at < 2 * c * n && wide == 2; at++) {
