@@ -141,7 +141,7 @@ def _by_torch(images: Tensor, where: Sampling, how: Sampler, kept: dict[int, Pyr
     # the same for all strips of an image, however many cores are free: the pyramids that they keep are of these parts
     step = count if wide or not plain else 1 if large else thread_count()
     if not large and count <= step:
-        if wide or not is_eager(images, where.grid):
+        if wide or not plain or not is_eager(images, where.grid):
             levels = _levels(kept, 0, widen(images))
             return narrow(_render(levels.images, where.grid, where, levels, how), dtype)
         # strip by strip, whose memory is used again: new memory takes as long as sampling
