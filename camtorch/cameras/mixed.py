@@ -426,4 +426,5 @@ def _joined(cls: type[Camera], function: Any, _: Any, given: Any = (), options: 
 
 # Samples that hold cameras then go through a DataLoader as they are. torch documents this map for the purpose.
 COLLATE_FUNCTIONS[Camera] = collate_cameras
+# set from here, because a batch of several models is a `Mixed`, which is a camera itself
 Camera.__torch_function__ = classmethod(_joined)  # type: ignore[attr-defined]

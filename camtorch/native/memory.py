@@ -21,9 +21,9 @@ back to the system, and a worker of a DataLoader spent a third of the time of a 
 
 
 def empty(shape: tuple[int, ...], dtype: torch.dtype, layout: torch.memory_format) -> Tensor:
-    """Return an empty CPU tensor in memory of large pages, which later results use again once no tensor is on it."""
+    """Return an empty CPU tensor; large ones in pages that later results use again once no tensor is on them."""
     size, strides = _place(shape, dtype, layout)
-    block = _block(size)
+    block = _block(size) if size >= LEAST else None
     if block is None:
         return torch.empty(shape, dtype=dtype, device="cpu", memory_format=layout)
     return tensor_on(block, dtype, shape, strides, lambda: _keep(block))

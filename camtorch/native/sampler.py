@@ -193,7 +193,8 @@ def lay(nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int]) -> t
     It is as in `Call`, and `cells` may be `CELL_QUINTIC`.
     """
     shape = cells.shape[0], *size
-    grid, mapped = _room((*shape, 2)), torch.empty(shape, dtype=torch.bool, device="cpu")
+    grid = memory.empty((*shape, 2), torch.float32, torch.contiguous_format)
+    mapped = torch.empty(shape, dtype=torch.bool, device="cpu")
     _lay(nodes.contiguous(), cells, exact, grid, mapped)
     return grid, mapped
 
@@ -218,12 +219,6 @@ def _lay(nodes: Tensor, cells: Tensor, exact: Tensor, grid: Tensor, mapped: Tens
     call.mapped, call.is_transposed = None if mapped is None else mapped.data_ptr(), mapped is None
     tasks = call.count if mapped is None else -(-grid[..., 0].numel() // _TILE)
     spread(functools.partial(loaded().camtorch_lay, call), min(thread_count(), tasks))
-
-
-def _room(shape: tuple[int, ...]) -> Tensor:
-    if math.prod(shape) * 4 >= memory.LEAST:
-        return memory.empty(shape, torch.float32, torch.contiguous_format)
-    return torch.empty(shape, dtype=torch.float32, device="cpu")
 
 
 def classify(
