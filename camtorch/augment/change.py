@@ -263,7 +263,8 @@ class Change:
     @property
     def single(self) -> Camera:
         """Return the camera after, of a change of one sample; its own, not that of the change."""
-        if isinstance(moves := self.parts[0].moves, LazyWarp):
+        moves = self.parts[0].moves
+        if isinstance(moves, LazyWarp) and moves.intrinsics.ndim == 1:
             return moves.new_target()
         return (self.target[0] if self.gate is not None else one_or_batch(self.parts[0].target)).clone()
 

@@ -348,6 +348,15 @@ def test_rows_that_nothing_applies_to_stay():
     assert flipped == {(1.0,), (-1.0,)}
 
 
+def test_the_camera_of_a_single_sample_is_single_whatever_applies():
+    lens = camera(dtype=torch.float32).requires_grad_(False)
+    chain = A.Compose([A.RandomMount(p=0.5), A.RandomLens("dms130", fov="source", p=0.5)], camera=lens)
+    torch.manual_seed(0)
+    outs = [chain(image=torch.rand(1, *SIZE)) for _ in range(12)]
+    assert {(out["camera"].batch_shape, out["rotation"].shape) for out in outs} == {((), (3, 3))}
+    assert {bool((out["camera"].intrinsics == lens.intrinsics).all()) for out in outs} == {True, False}
+
+
 def test_light_and_colours_go_through_edits():
     lens = camera(dtype=torch.float32)
     image = torch.full((2, 3, *SIZE), 200, dtype=torch.uint8)
