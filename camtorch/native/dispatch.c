@@ -2,6 +2,9 @@
 #include <layout.h> /* which the build makes of these headers, see headers.py: sizes and offsets by the names of fields */
 #include <stddef.h>
 #include <string.h>
+#if defined(HAS_AVX512) || defined(HAS_AVX2)
+#include <cpuid.h>
+#endif
 
 #include "consensus.h"
 #include "draws.h"
@@ -47,17 +50,23 @@ enum { BASELINE, AVX2, AVX512 };
 static const char *const NAMES[] = {"baseline", IF_AVX2([AVX2] = "avx2", ) IF_AVX512([AVX512] = "avx512")};
 static int chosen = -1; /* no variant yet */
 
+/* By CPUID itself, as `__builtin_cpu_supports` says no to everything where a compiler's library has no __cpu_model, as zig's;
+ * XCR0 says which registers the system keeps: 6 those of AVX, 0xe0 also those of AVX-512 */
 static int best(void) {
 #if defined(HAS_AVX512) || defined(HAS_AVX2)
-    __builtin_cpu_init();
-#endif
+    const unsigned first = bit_OSXSAVE | bit_FMA | bit_F16C, second = bit_AVX2 | bit_BMI2;
+    unsigned a, b, c, d, kept;
+    if (!__get_cpuid(1, &a, &b, &c, &d) || (c & first) != first) return BASELINE;
+    if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || (b & second) != second) return BASELINE;
+    __asm__("xgetbv" : "=a"(kept), "=d"(d) : "c"(0));
+    if ((kept & 6) != 6) return BASELINE;
 #ifdef HAS_AVX512
-    if (__builtin_cpu_supports("avx512vbmi") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"))
-        return AVX512;
+    const unsigned third = bit_AVX512F | bit_AVX512DQ | bit_AVX512BW | bit_AVX512VL;
+    if ((kept & 0xe0) == 0xe0 && (b & third) == third && (c & bit_AVX512VBMI)) return AVX512;
 #endif
 #ifdef HAS_AVX2
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2")) return AVX2;
+    return AVX2;
+#endif
 #endif
     return BASELINE;
 }
