@@ -38,7 +38,9 @@ def changed(text, changes):
         lines = [(line[:1], line[1:]) for line in hunk.splitlines()]
         assert {mark for mark, _ in lines} <= {" ", "+", "-"}, hunk
         old = [re.sub(r"\\\.\\\.\\\.$", ".*", re.escape(line)) for mark, line in lines if mark != "+"]
-        (found,) = re.finditer("^" + "\n".join(old) + "$", text, re.M)
+        places = [*re.finditer("^" + "\n".join(old) + "$", text, re.M)]
+        assert len(places) == 1, f"the page shows lines that must be in the file once; got {len(places)}:\n{hunk}"
+        (found,) = places
         was = iter(found[0].split("\n"))
         new = [line if mark == "+" else next(was) for mark, line in lines]
         kept = [line for line, (mark, _) in zip(new, lines, strict=True) if mark != "-"]

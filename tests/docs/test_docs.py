@@ -26,6 +26,7 @@ from videos import write_video
 import camtorch as ct
 from camtorch.boards.boards import Chessboard
 from camtorch.cli.main import main
+from camtorch.io import formats
 
 ROOT = Path(__file__).parents[2]
 COLUMNS = 80  # of code: what a page shows without scrolling
@@ -178,6 +179,11 @@ def test_every_entry_of_the_reference_is_there():
 def test_every_format_has_a_row():
     page = (ROOT / "docs" / "guides" / "files.md").read_text()
     assert [name for name in ct.io.FORMATS if f'| `"{name}"` |' not in page] == []
+
+
+def test_every_format_is_in_the_docstrings():
+    assert [names.title for names in formats.READ.values() if names.title.split()[0] not in ct.load.__doc__] == []
+    assert [name for name in formats.WRITTEN if f'"{name}"' not in ct.save.__doc__] == []
 
 
 def test_every_page_is_in_the_navigation():
