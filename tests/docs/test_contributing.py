@@ -141,7 +141,8 @@ def test_the_places_are_there():
     for file, name in places:
         assert (ROOT / file).exists(), file
         text = (ROOT / file).read_text() if name else ""
-        made = rf"^(?:(?:def|class|#define) {name}\b|{name}\b.*=|static .*\bT\({name}\)\(|(?:from|import) .*\b{name}\b)"
+        in_c = rf"(?:static|INLINE) .*\b(?:T\({name}\)|{name})\("
+        made = rf"^(?:(?:def|class|#define) {name}\b|{name}\b.*=|{in_c}|(?:from|import) .*\b{name}\b)"
         assert not name or re.search(made, text, re.M), f"{file} has no {name}"
 
 
