@@ -1,4 +1,4 @@
-"""New cameras of drawn numbers, by native code; `cameras.py` has the same formulas, recorded by torch."""
+"""New cameras of drawn numbers, by native code; `new_camera` in `drawer.py` has the same formulas in torch."""
 
 from __future__ import annotations
 
