@@ -140,7 +140,7 @@ class Batch(NamedTuple):
     plan: SamplePlan
     values: Mapping[str, Any]  # as they came, where these are tensors; without a dim B if the plan is not `batched`
     camera: Camera
-    checked: bool  # whether values need no check any more, or may be bad; those of a known form are not checked yet
+    checked: bool  # True: values were checked, or may be bad; False: their form is known, and `_moved` checks them
 
     def rows(self) -> dict[str, tuple[str, Any]]:
         """Return name -> kind and value, with a dim B."""
