@@ -72,7 +72,7 @@ def check_wheel(path: Path, kind: str) -> None:
     with zipfile.ZipFile(path) as file:
         held = {member.filename: member.compress_size for member in file.infolist() if not member.is_dir()}
         metadata = next(file.read(name).decode() for name in held if name.endswith(".dist-info/METADATA"))
-    code = "cameras/camera.py", "__init__.pyi", "models/__init__.pyi", "py.typed", "native/kernel.c"
+    code = "cameras/camera.py", "__init__.pyi", "models/__init__.pyi", "py.typed", "native/sampler.c"
     assert {COLLECTION, *(f"camtorch/{name}" for name in code)} <= set(held)
     assert all(name.split("/")[0] == "camtorch" or ".dist-info/" in name for name in held)
     assert not [name for name in held if not name.isascii()]

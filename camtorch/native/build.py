@@ -71,7 +71,7 @@ def build(directory: str | os.PathLike[str] | None = None, *, sources: str | os.
 
     Args:
         directory: The library's folder; by default the one in which camtorch looks for it.
-        sources: The folder of `kernel.c` and `dispatch.c`; by default this file's.
+        sources: The folder of the C files; by default this file's.
 
     Returns:
         The path of the library.
@@ -101,8 +101,8 @@ def build(directory: str | os.PathLike[str] | None = None, *, sources: str | os.
         Path(folder, "layout.h").write_text(runpy.run_path(str(_HERE / "headers.py"))["layout_h"](here), "utf-8")
         has = [*(f"-DHAS_{name.upper()}" for name in known if name != "baseline"), f"-DSOURCES={checksum(here)}u"]
         units = {"dispatch": [str(here / "dispatch.c"), "-I.", *has]}
-        for kernel in sorted(set(here.glob("*.c")) - {here / "dispatch.c"}):
-            units |= {f"{kernel.stem}_{name}": [str(kernel), *known[name], f"-DVARIANT={name}"] for name in known}
+        for unit in sorted(set(here.glob("*.c")) - {here / "dispatch.c"}):
+            units |= {f"{unit.stem}_{name}": [str(unit), *known[name], f"-DVARIANT={name}"] for name in known}
         objects = _objects(here) or Path(folder)
         version = _run([*command, "--version"], folder)
 
@@ -126,7 +126,7 @@ def build(directory: str | os.PathLike[str] | None = None, *, sources: str | os.
             missing = [name for name, place in places.items() if not place.exists()]
             if len(missing) > 1:
                 what = f"compiling {len(missing)} units of {len(units)}, for {', '.join(known)}"
-                print(f"{what}: geometry and kernel take some 10 s each, the others 1 s", file=sys.stderr, flush=True)
+                print(f"{what}: geometry and sampler take some 10 s each, the others 1 s", file=sys.stderr, flush=True)
             list(pool.map(compiled, missing))
         libraries = [] if sys.platform == "win32" else ["-lm"]
         _run([*command, "-shared", "-o", LIBRARY, *map(str, places.values()), *libraries], folder)

@@ -12,12 +12,9 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "unit.h"
+
 #define ALIGNED __attribute__((aligned(64)))
-#define INLINE static inline __attribute__((always_inline))
-#define NOT_INLINE __attribute__((noinline))
-#define JOINED_(a, b) a##_##b
-#define JOINED(a, b) JOINED_(a, b)
-#define THIS(name) JOINED(name, VARIANT)
 
 enum { LANES = 16 };      /* a block is filled up to a multiple of it */
 enum { MOST_STEPS = 5 };  /* of Newton's method; what then still moves is left to brackets and searches */

@@ -6,10 +6,7 @@
 #include <stdint.h>
 #include <string.h>
 
-/* A name of the variant that is compiled */
-#define NAMED(name, variant) name##_##variant
-#define EXPANDED(name, variant) NAMED(name, variant)
-#define THIS(name) EXPANDED(name, VARIANT)
+#include "unit.h"
 
 static inline double number(const void *from, int64_t at, int64_t is_double) {
     return is_double ? ((const double *)from)[at] : ((const float *)from)[at];

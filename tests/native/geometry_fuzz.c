@@ -56,7 +56,7 @@ void sample_images_fuzzed(const Images *given) {
     for (int64_t i = 0; i < given->count; i++) sampled += given->image >= 0 && given->image < given->jobs[i].count;
 }
 
-/* In the place of the one that kernel.c has, which has a fuzz of its own: cells of any kind */
+/* In the place of the one that lattice.c has, which has a fuzz of its own: cells of any kind */
 int32_t classify_fuzzed(const Classification *given) {
     int32_t todo = 0;
     for (int64_t i = 0; i < given->rows * given->columns; i++) {

@@ -17,7 +17,7 @@ COMPILER = os.environ.get("CC") or next(filter(shutil.which, ("cc", "gcc", "clan
 compiles = pytest.mark.skipif(COMPILER is None, reason="no C compiler is here: neither CC nor cc, gcc or clang")
 
 # as small as a sampler can be: what is tested here is how it is built
-KERNEL = """
+SAMPLER = """
 #define NAME_(variant) twice_##variant
 #define NAME(variant) NAME_(variant)
 int NAME(VARIANT)(int x) { return 2 * x; }
@@ -34,8 +34,8 @@ API int twice_fast(int x) { return twice_avx2(x); }
 """
 
 
-def write(folder, kernel=KERNEL):
-    (folder / "kernel.c").write_text(kernel)
+def write(folder, sampler=SAMPLER):
+    (folder / "sampler.c").write_text(sampler)
     (folder / "dispatch.c").write_text(DISPATCH)
     return folder
 
@@ -50,7 +50,7 @@ def no_compiler(monkeypatch, tmp_path):
 def test_a_library_is_built_and_nothing_else_is_left(tmp_path):
     write(tmp_path)
     path = build(tmp_path, sources=tmp_path)
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIBRARY, "_objects", "dispatch.c", "kernel.c"])
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIBRARY, "_objects", "dispatch.c", "sampler.c"])
     loaded, inode = ctypes.CDLL(str(path)), path.stat().st_ino
     assert not hasattr(loaded, "twice_baseline")  # what is not marked stays inside
     assert not [name for name in (b"Py", b"crtfast", b"OMP") if name in path.read_bytes()]
@@ -76,7 +76,7 @@ def test_every_variant_that_the_compiler_knows_is_in_it(tmp_path, monkeypatch):
 
 @compiles
 def test_more_words_reach_the_compiler_and_the_linker(tmp_path, monkeypatch):
-    write(tmp_path, kernel="#ifndef MORE\n#error no MORE\n#endif\n" + KERNEL)
+    write(tmp_path, sampler="#ifndef MORE\n#error no MORE\n#endif\n" + SAMPLER)
     with pytest.raises(BuildError, match="no MORE"):
         build(tmp_path, sources=tmp_path)
     monkeypatch.setenv("CC", f"{COMPILER} -DMORE -g -fsanitize=undefined")
@@ -87,18 +87,18 @@ def test_more_words_reach_the_compiler_and_the_linker(tmp_path, monkeypatch):
 def test_an_error_is_what_the_compiler_said_and_leaves_the_library_that_was(tmp_path):
     write(tmp_path)
     before = build(tmp_path, sources=tmp_path).read_bytes()
-    write(tmp_path, kernel="int broken(void) { return nowhere; }\n")
+    write(tmp_path, sampler="int broken(void) { return nowhere; }\n")
     with pytest.raises(BuildError, match="nowhere") as caught:
         build(tmp_path, sources=tmp_path)
-    assert "kernel.c" in str(caught.value)
+    assert "sampler.c" in str(caught.value)
     assert (tmp_path / LIBRARY).read_bytes() == before
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIBRARY, "_objects", "dispatch.c", "kernel.c"])
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIBRARY, "_objects", "dispatch.c", "sampler.c"])
 
 
 @compiles
 def test_a_unit_is_compiled_again_if_it_or_its_headers_or_the_options_changed(tmp_path, monkeypatch, capfd):
     (tmp_path / "twice.h").write_text("enum { TWO = 2 }; /* a number */\n")
-    write(tmp_path, kernel='#include "twice.h"\n' + KERNEL.replace("2 *", "TWO *"))
+    write(tmp_path, sampler='#include "twice.h"\n' + SAMPLER.replace("2 *", "TWO *"))
     monkeypatch.setattr(building, "VARIANTS", {"baseline": (), "avx2": ("-O1",)})
 
     def compiled():
@@ -111,7 +111,7 @@ def test_a_unit_is_compiled_again_if_it_or_its_headers_or_the_options_changed(tm
 
     done = []
     assert compiled() == compiled() == (42, set())
-    assert done == [["dispatch", "kernel_avx2", "kernel_baseline"], []]
+    assert done == [["dispatch", "sampler_avx2", "sampler_baseline"], []]
     assert "compiling 3 units of 3, for baseline, avx2" in capfd.readouterr().err
     (tmp_path / "twice.h").write_text("enum { TWO = 2 }; /* another comment */\n")
     compiled()
@@ -120,7 +120,7 @@ def test_a_unit_is_compiled_again_if_it_or_its_headers_or_the_options_changed(tm
     assert compiled() == (63, set())
     monkeypatch.setenv("CC", f"{COMPILER} -DMORE")
     compiled()
-    assert done[2:] == [["dispatch"], ["dispatch", "kernel_baseline"], ["dispatch", "kernel_baseline"]]
+    assert done[2:] == [["dispatch"], ["dispatch", "sampler_baseline"], ["dispatch", "sampler_baseline"]]
     monkeypatch.setenv("CAMTORCH_VARIANTS", "baseline,sse9")
     with pytest.raises(BuildError, match="must be some of baseline,avx2; got baseline,sse9"):
         compiled()

@@ -311,7 +311,8 @@ def test_the_environment_forces_a_variant(each_variant, monkeypatch):
 def test_no_read_outside_and_nothing_undefined_in_any_variant(fuzzed):
     variants = {name: building.VARIANTS[name] for name in runs_here()}
     # the way without vectors is what the others are compared with
-    assert fuzzed("sampler_fuzz.c", ["kernel.c"], {"plain": ("-DCAMTORCH_PLAIN",)} | variants, 4000, 250) == [*variants]
+    all_ways = {"plain": ("-DCAMTORCH_PLAIN",)} | variants
+    assert fuzzed("sampler_fuzz.c", ["sampler.c", "lattice.c"], all_ways, 4000, 250) == [*variants]
 
 
 def kept(warp):

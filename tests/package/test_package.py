@@ -42,7 +42,7 @@ def checkout(tmp_path):
     for name in ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE", ".gitignore"):
         shutil.copy(ROOT / name, folder)
     native = folder / "camtorch" / "native"
-    (native / "kernel.c").write_text("int VARIANT;\n")
+    (native / "sampler.c").write_text("int VARIANT;\n")
     (native / "dispatch.c").write_text("unsigned camtorch_sources(void) { return SOURCES; }\n")
     (native / LIBRARY).write_bytes(b"older")
     return folder
