@@ -87,13 +87,15 @@ EXPORTED int32_t camtorch_use(const char *name) {
     return 0;
 }
 
-EXPORTED unsigned camtorch_sources(void) { return SOURCES; }
+/* In one row, which .ci/wheels.py looks for in a library of another machine */
+static const uint32_t BUILT_FROM[] = {SOURCES, CHECKSUM, OFFSETS};
+
+EXPORTED unsigned camtorch_sources(void) { return BUILT_FROM[0]; }
 
 /* A checksum of the structures; `layout` of structure.py is of those of Python */
 EXPORTED unsigned camtorch_layout(void) {
-    static const uint32_t numbers[] = {OFFSETS};
-    uint32_t sum = CHECKSUM;
-    for (size_t i = 0; i < sizeof numbers / sizeof *numbers; i++) sum = (sum ^ numbers[i]) * 16777619u;
+    uint32_t sum = BUILT_FROM[1];
+    for (size_t i = 2; i < sizeof BUILT_FROM / sizeof *BUILT_FROM; i++) sum = (sum ^ BUILT_FROM[i]) * 16777619u;
     return sum;
 }
 

@@ -64,7 +64,7 @@ static void T(pieces)(const Part *part, const R *nodes, int n, const R *restrict
     else for (; step; step /= 2)
         EACH(i) {
             const I next = piece[i] + step, at = next < last ? next : last;
-            piece[i] = (next <= last) & (nodes[at] <= offset[i]) ? next : piece[i];
+            piece[i] = ((next <= last) & (nodes[at] <= offset[i])) ? next : piece[i];
         }
     EACH(i) offset[i] -= nodes[piece[i]];
 }
@@ -386,7 +386,7 @@ static void T(lens)(const T(Camera) *c, int first, int n, const R *a, const R *b
                 /* a turn by half a circle has a positive determinant too: the trace tells it */
                 const R trace = made->ua[i] + made->vb[i], area = made->ua[i] * made->vb[i] - made->ub[i] * made->va[i];
                 R w = trace < area ? trace : area;
-                w = margin[i] < w ? margin[i] : w, w = (trace == trace) & (margin[i] == margin[i]) ? w : -1;
+                w = margin[i] < w ? margin[i] : w, w = ((trace == trace) & (margin[i] == margin[i])) ? w : -1;
                 w = w == w ? w : -1;
                 least[i] = j == first || w < least[i] ? w : least[i];
             }

@@ -26,7 +26,7 @@ static int T(by_rays)(const Move *move, const T(Between) *b, int count, int n, R
     int left = 0;
     T(solutions)(&b->from, n, u, v, known, ok, s.x, s.y, s.z);
     if (b->from.waits)
-        for (int i = 0; i < count; i++) left |= !ok[i] & (known[i] != 0) ? LEFT_FROM : 0;
+        for (int i = 0; i < count; i++) left |= (!ok[i] & (known[i] != 0)) ? LEFT_FROM : 0;
     if (move->turns) T(product)(b->turn, 1, 3, n, s.x, s.y, s.z);
     left |= T(pixels_of)(&b->to, count, n, &s, u, v) ? LEFT_TO : 0;
     EACH(i) ok[i] &= s.ok[i];

@@ -4,6 +4,8 @@
 
 #include <stdint.h>
 
+#include "glibc.h"
+
 #if defined(_MSC_VER)
 #define EXPORTED __declspec(dllexport)
 #else

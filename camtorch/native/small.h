@@ -6,6 +6,7 @@
 #include <stdint.h>
 #include <string.h>
 
+#include "glibc.h"
 #include "unit.h"
 
 static inline double number(const void *from, int64_t at, int64_t is_double) {
