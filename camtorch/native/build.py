@@ -25,8 +25,11 @@ from contextlib import suppress
 from pathlib import Path
 
 _HERE = Path(__file__).resolve().parent
-_MACHINE = platform.machine().lower()
-_SUFFIX = {"win32": "dll", "darwin": "dylib"}.get(sys.platform, "so")
+# as in "macosx-11.0-arm64": Python's own name for the kind of machine to build for, if that is another than this one
+_HOST = os.environ.get("_PYTHON_HOST_PLATFORM", "")
+_MACHINE = (_HOST.rpartition("-")[2] or platform.machine()).lower()
+_SYSTEM = _HOST.partition("-")[0] or sys.platform
+_SUFFIX = {"win": "dll", "win32": "dll", "macosx": "dylib", "darwin": "dylib"}.get(_SYSTEM, "so")
 
 # two dots in its name, as tools that walk a package's modules would import a _sampler.so
 LIBRARY = f"_sampler.{_MACHINE}.{_SUFFIX}"
@@ -34,8 +37,9 @@ LIBRARY = f"_sampler.{_MACHINE}.{_SUFFIX}"
 # the file in which installation gives the reason, in one line, why it built no library
 REASON = "_sampler.reason.txt"
 
-_FLAGS = ["-std=gnu11", "-O3", "-fPIC", "-fvisibility=hidden"]
+_FLAGS = ["-std=gnu11", "-O3", "-fvisibility=hidden"]
 _FLAGS += ["-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"]
+_FLAGS += [] if _SUFFIX == "dll" else ["-fPIC"]
 _AVX2 = ("-mavx2", "-mfma", "-mf16c", "-mbmi2")
 _AVX512 = ("-mavx512f", "-mavx512vl", "-mavx512bw", "-mavx512dq", "-mavx512vbmi")
 # the kinds of CPU that have code of their own, and its options; every library has the first
@@ -128,7 +132,7 @@ def build(directory: str | os.PathLike[str] | None = None, *, sources: str | os.
                 what = f"compiling {len(missing)} units of {len(units)}, for {', '.join(known)}"
                 print(f"{what}: geometry and sampler take some 10 s each, the others 1 s", file=sys.stderr, flush=True)
             list(pool.map(compiled, missing))
-        libraries = [] if sys.platform == "win32" else ["-lm"]
+        libraries = [] if _SUFFIX == "dll" else ["-lm"]
         _run([*command, "-shared", "-o", LIBRARY, *map(str, places.values()), *libraries], folder)
         os.replace(Path(folder, LIBRARY), target)
     return target
