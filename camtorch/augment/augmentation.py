@@ -264,7 +264,9 @@ class Augmentation(SampleTransform):
     def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
         """Return drawn values, (*B,) or (*B, size); without *B if all are alike, so that one map serves all samples."""
         if isinstance(draw["apply"], list):  # of one sample
-            return {name: value[0] for name, value in draw.items() if name != "apply"}
+            values = {name: value[0] for name, value in draw.items()}
+            del values["apply"]
+            return values
         values = {name: value for name, value in draw.items() if name != "apply"}
         if source.batch_shape or (len(draw["apply"]) != 1 and not all(map(_are_alike, values.values()))):
             return values

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -45,15 +46,14 @@ class LazyWarp:
     """A warp to cameras of which native code wrote the numbers; warp and cameras become modules at first use."""
 
     base: Camera  # of whose model the new cameras are
-    intrinsics: Tensor  # (4,) of one, or (B, 4)
-    distortion: Tensor  # (n,) of one, or (B, n)
+    intrinsics: np.ndarray[Any, Any]  # (4,) of one, or (B, 4)
+    distortion: np.ndarray[Any, Any]  # (n,) of one, or (B, n)
     image_size: tuple[int, int]
     rotation: Tensor | None  # (3, 3) or (B, 3, 3), or None
     options: Options  # of the warp
     start: Native | None  # the cameras before, for native code
     native: Native | None  # the new cameras for native code; None if they are not made yet
-    factor: Sequence[float]  # (B,), on the focal lengths, that `min_filled` asks for
-    found: Sequence[float]  # (B,): the share of each image that is filled
+    filled: Sequence[float]  # (2 B,): the factors on focal lengths that `min_filled` asks for, and what is filled then
     is_turn: bool = True  # of a single one: whether the rotation is no mirror
     made: Warp | None = field(default=None, init=False)  # the warp, from its first use on
     own: Camera | None = field(default=None, init=False)  # the target, from its first use on
@@ -74,10 +74,10 @@ class LazyWarp:
                 return self.new_target(count)
         numbers, k = self.intrinsics, self.distortion
         if count is not None:
-            numbers, k = numbers.expand(count, -1), k.expand(count, -1)
-        numbers, k = nn.Parameter(numbers.clone(), requires_grad=False), k.clone()
-        k = nn.Parameter(k, requires_grad=False) if k.shape[-1] else k
-        return remade(self.base, intrinsics=numbers, distortion=k, image_size=self.image_size)
+            numbers, k = (np.broadcast_to(each, (count, each.shape[-1])) for each in (numbers, k))
+        intrinsics, distortion = torch.from_numpy(numbers.copy()).as_subclass(nn.Parameter), torch.from_numpy(k.copy())
+        distortion = distortion.as_subclass(nn.Parameter) if k.shape[-1] else distortion
+        return remade(self.base, intrinsics=intrinsics, distortion=distortion, image_size=self.image_size)
 
     def warp(self, source: Camera) -> Warp:
         if self.made is None:

@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from typing import Any, ClassVar, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
@@ -31,7 +31,6 @@ from camtorch.poses.rotations import mount_elements
 from camtorch.rays.lattices import field_of_view
 from camtorch.values.arguments import LEFT, as_image_size, broadcast_shapes, check_degrees, warn
 from camtorch.values.module import remade
-from camtorch.warp.panorama import PANORAMAS
 from camtorch.warp.vignetting import vignetting
 from camtorch.warp.warp import Warp
 
@@ -59,6 +58,7 @@ _LIMITS: dict[str, dict[str, Any]] = {
 _EXACT = "fov", "crop", "vignetting", "cos4"  # a single number is a range of only that number
 _AUTO = "focal", "centre", "distortion", "crop"
 _told: set[tuple[object, ...]] = set()
+_PLAIN = frozenset((Tensor, nn.Parameter))
 
 
 class LensOptions(EditOptions, total=False):
@@ -207,10 +207,15 @@ class CameraDrawer(Augmentation):
         """Return the warp of a draw by native code; None if something is recorded, or that lacks a model."""
         if type(self).new_camera is not CameraDrawer.new_camera:
             return None
-        like = self._like_for(source)
-        tensors = source.intrinsics, source.distortion, *(() if like is None else like.tensors)
-        if isinstance(next(iter(values.values()), None), Tensor) or not are_numbers(*tensors):
+        like = None if self.like is None else self._like_for(source)
+        tensors = (source.intrinsics, source.distortion) if like is None else (*source.tensors, *like.tensors)
+        # numbers come where nothing is recorded; without any, it is asked
+        first, learns = next(iter(values.values()), None), torch.is_grad_enabled()
+        if isinstance(first, Tensor) or (first is None and not are_numbers()):
             return None
+        for tensor in tensors:
+            if type(tensor) not in _PLAIN or not tensor.is_cpu or (learns and tensor.requires_grad):
+                return None
 
         def start() -> Start | None:
             base, sized, reach = self._base(source.detach().clone(), values.get("lens"))
@@ -222,24 +227,26 @@ class CameraDrawer(Augmentation):
             found = start()
         else:
             # all else that new cameras depend on
-            own = self._calls.revision, like and like.image_size, self.ranges.get("fov"), share
-            key = "start", type(source), source.image_size, *own, *values
+            sizes = source.image_size, None if like is None else like.image_size
+            key = "start", type(source), *sizes, self._calls.revision, self.ranges.get("fov"), share, *values
             known = self._memo.entry(tensors, key)
             found = self._memo(tensors, key, start) if known is None else known[2]
-        own_lens = like is None and not self._is_real
-        return None if found is None else found.warp(values, source if own_lens else found.base, self.options)
+        if found is None:
+            return None
+        return found.warp(values, source if like is None and not self._is_real else found.base, self.options)
 
     def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._values(source, draw)
         made = self._lazy_warp(source, values, self.min_filled)
         if made is None:
             return super()._part(source, draw)
-        if self.min_filled and (min(made.found, default=1) < self.min_filled or max(made.factor, default=1) > 1):
-            factor, found = (torch.tensor(values, dtype=torch.float64) for values in (made.factor, made.found))
-            self._tell_of(source, lambda: made.target, factor, found)
-        simple = self.options["tolerance"] and not self.options["antialias"] and made.native is not None
-        simple = simple and self.beside_the_camera.isdisjoint(self.ranges)
-        if simple and not isinstance(source, PANORAMAS) and not isinstance(made.base, PANORAMAS):
+        if self.min_filled:
+            rows = len(made.filled) // 2
+            factor, found = made.filled[:rows], made.filled[rows:]
+            if min(found, default=1) < self.min_filled or max(factor, default=1) > 1:
+                self._tell_of(source, lambda: made.target, *map(torch.tensor, (factor, found)))
+        simple = made.native is not None and self.options["tolerance"] and not self.options["antialias"]
+        if simple and self.beside_the_camera.isdisjoint(self.ranges):
             return Part(source, made)
         return self._part_between(source, made.target, made.rotation, values)
 

@@ -24,6 +24,7 @@ from camtorch.projection.rows import CameraRows, domain_for, single_native
 from camtorch.rays.lattices import defined_or
 from camtorch.values.arguments import present
 from camtorch.values.module import model_of, remade
+from camtorch.warp.panorama import PANORAMAS
 from camtorch.warp.sampling import Options
 
 _SIZES = {"centre": 2, "distortion": structs.AMOUNTS, "place": 2}
@@ -78,19 +79,23 @@ class Start:
         """
         self.before, self.base, self.size, self._native = before, base, size, native
         self.names: list[str] = [name for name in _KINDS if name in names]
+        self._has_rows = not _SIZES.keys().isdisjoint(names)  # whether some values are several numbers
+        self._share, self._is_flat = share, not isinstance(source, PANORAMAS) and not isinstance(base, PANORAMAS)
         self._rows = len(sized) if sized.ndim == 2 else native.cameras if base.batch_shape else 0
         self._turns, self._moves, self._knows = not _TURNS.isdisjoint(names), nominal is not None, False
         self._kinds = (c_float, np.float32) if native.dtype == torch.float32 else (c_double, np.float64)
         self._follows = False  # whether new lenses need limits on azimuths
         self._distortion = base.distortion.detach()
+        self._coefficients: np.ndarray[Any, Any] = self._distortion.numpy()
         count = self._distortion.shape[-1]
-        call = self._call = structs.Draws(count=count, height=size[0], width=size[1], is_each=self._rows > 0)
+        call = self._call = structs.Draws(cameras=1, count=count, height=size[0], width=size[1], is_each=self._rows > 0)
         call.first[:] = [-1] * structs.DRAWN_KINDS
         at, self._room = 0, 13 + count
         for name in self.names:
             call.first[_KINDS[name]], at = at, at + _SIZES.get(name, 1)
         native.add_table()  # the table of the inverse, for cameras that unproject
         call.base, call.made, call.made.usable = native.pointer, native.struct, None
+        call.made.cameras = 1
         call.sized = self._keep(sized)
         call.reach = None if reach is None else self._keep(reach.double())
         if share:
@@ -136,28 +141,28 @@ class Start:
     def warp(self, values: Mapping[str, Any], base: Camera, options: Options) -> LazyWarp:
         """Return the warp to cameras like `base` of values (B,) and (B, size), or numbers and lists for one."""
         call, native, names = structs.Draws.from_buffer_copy(self._call), self._native, self.names
-        first = values[names[0]] if names else None
-        rows = self._rows or (len(first) if isinstance(first, np.ndarray) else 1)
-        is_one = not self._rows and not isinstance(first, np.ndarray)
-        given: Any
-        if is_one:
-            flat: list[float] = []
-            for name in names:
-                value = values[name]
-                flat += value if isinstance(value, list) else (value,)
-            given = _array(c_double, len(flat))(*flat)
-            call.values = addressof(given)
-        elif names:
-            given = np.concatenate([values[name] for name in names], None)
+        given: Any = [values[name] for name in names]
+        is_one, rows, (of_numbers, dtype) = not self._rows, self._rows or 1, self._kinds
+        if given and isinstance(given[0], np.ndarray):
+            is_one, rows = False, self._rows or len(given[0])
+        if not is_one and given:
+            given = np.concatenate(given, None)
             call.values = given.ctypes.data
-        filled = _array(c_double, 2 * rows)()  # the factors, and what is filled
+        elif is_one:
+            given = [n for v in given for n in (v if isinstance(v, list) else (v,))] if self._has_rows else given
+            given = _array(c_double, len(given))(*given)
+            call.values = addressof(given)
         # numpy cuts this in half the time of torch
-        kind, dtype = self._kinds
-        room = _array(kind, rows * self._room)()
+        room = _array(of_numbers, rows * self._room)()
         numbers = np.frombuffer(room, dtype)
-        call.cameras = call.made.cameras = rows
-        call.room, call.factors = addressof(room), addressof(filled)
-        call.filled = call.factors + 8 * rows
+        call.room = addressof(room)
+        if rows != 1:  # as they are one at first
+            call.cameras = call.made.cameras = rows
+        filled: Sequence[float] = ()
+        if self._share:
+            filled = shares = _array(c_double, 2 * rows)()  # the factors, and what is filled
+            call.factors = addressof(shares)
+            call.filled = call.factors + 8 * rows
         tries = self._tries(values, rows, call) if rows and self._moves and not self._knows else None
         kept: list[Any] = [numbers]
         run = loaded().camtorch_draws
@@ -175,22 +180,25 @@ class Start:
                 self._follows = True
                 kept += self._limits(call, rows)
             self._follow(left, call)
-        if call.followed < rows and self._moves:
+        if self._moves and call.followed < rows:
             call.made.limits2 = call.made.extent = None
         several = () if is_one else (rows,)
-        intrinsics, rotation, k = torch.from_numpy(numbers[: 4 * rows].reshape(*several, 4)), None, self._distortion
+        intrinsics, rotation, k = numbers[: 4 * rows], None, self._coefficients
         if self._turns:
             rotation = torch.from_numpy(numbers[4 * rows : 13 * rows].reshape(*several, 3, 3))
         if self._moves:
-            k = torch.from_numpy(numbers[13 * rows : (13 + call.count) * rows].reshape(*several, call.count))
+            k = numbers[13 * rows : (13 + call.count) * rows].reshape(*several, call.count)
+        if several:
+            intrinsics = intrinsics.reshape(rows, 4)
         made = None
-        if not left and (self._knows or not self._moves) and (self._knows or native.cameras == rows):
+        if left or not self._is_flat:
+            pass
+        elif self._knows or (not self._moves and native.cameras == rows):
             lenses = partial(self._lenses, numbers, rows) if self._knows else lambda _: native.lenses
             made = Native.made(native, call.made, (call, kept, self), lenses)
-        elif is_one and not left:
-            made = single_native(model_of(self.base), intrinsics, k)
-        factor, found = filled[:rows], filled[rows:]
-        return LazyWarp(base, intrinsics, k, self.size, rotation, options, self.before, made, factor, found)
+        elif is_one:
+            made = single_native(model_of(self.base), torch.from_numpy(intrinsics), torch.from_numpy(k))
+        return LazyWarp(base, intrinsics, k, self.size, rotation, options, self.before, made, filled)
 
     def _follow(self, left: int, call: structs.Draws) -> None:
         """Compute limits and ends that C lacked of the cameras that it starts from."""

@@ -39,6 +39,8 @@ class SamplePlan:
     masks: Sequence[str]  # names of the masks of validity that come out: "image_valid" and so on
     mask_fill: float
     calls: Kept | None  # the names of the fields that one call of C moves, and the call; None if a graph may want them
+    of_one: bool  # whether cameras are a batch of one, which serves all samples
+    has_matrices: bool  # whether some field is a camera matrix
 
     def rows(self, value: Any) -> Any:
         """Return a value with a dim B; a list has one already."""
@@ -49,8 +51,8 @@ class SamplePlan:
 
         The other fields, and all of them if no call serves, are not in the result.
         """
-        part, is_single = change.parts[0], change.count == 1
-        moves, calls = part.moves, self.calls
+        part, calls = change.parts[0], self.calls
+        moves = part.moves
         if calls is None or moves is None or part.rows is not None or change.gate is not None or not self.count:
             return {}
         if not native_available():
@@ -58,11 +60,13 @@ class SamplePlan:
         if (natives := part.natives()) is None:
             return {}
         source, target, rotation = natives
-        if max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != self.count:
-            return {}
-        options, sizes = moves.options, (part.camera.size_for("Warp"), part.image_size)
-        turns = source.dtype if is_single and isinstance(moves, LazyWarp) else None
-        is_turn = isinstance(moves, LazyWarp) and is_single and moves.is_turn
+        options, turns, is_turn = moves.options, None, False
+        if self.count > 1 or not isinstance(moves, LazyWarp):
+            if max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != self.count:
+                return {}
+        else:
+            turns, is_turn = source.dtype, moves.is_turn
+        sizes = part.camera.size_for("Warp"), part.image_size
         settings = sizes, source.dtype, turns, is_turn, thread_count(), *options.values()
         if (known := calls.entry((), settings)) is None:
             ways = self._ways(values, options, turns, is_turn)

@@ -92,32 +92,30 @@ def draw(
     """
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
-    rows, total = min(count, 1) if same else count, 0
-    for interval in ranges.values():
-        total += rows * (interval.size or 1)
+    rows = min(count, 1) if same else count
+    total = rows * sum([interval.size or 1 for interval in ranges.values()])
     device = "cpu" if generator is None else generator.device
     # the order is kornia's: the gate first
     gate = torch.rand(rows, generator=generator, dtype=torch.float32, device=device) < p if 0 < p < 1 else None
     # in float64, so that what is drawn is what every precision sees
     shares: Any = torch.rand(total, generator=generator, dtype=torch.float64, device=device)
-    applied: Any
-    is_single = False
-    if is_eager(shares):
-        is_single = rows == count == 1
-        shares = shares.tolist() if is_single else shares.numpy()
-        applied = [p >= 1] * rows if gate is None else gate.tolist()
-        applied = applied if is_single else np.array(applied, bool)
+    if not is_eager(shares):
+        values: dict[str, Any] = {"apply": torch.full((rows,), p >= 1, device=device) if gate is None else gate}
+    elif rows == count == 1:
+        values, share = {"apply": [p >= 1] if gate is None else gate.tolist()}, iter(shares.tolist())
+        for name, one in ranges.items():  # values are drawn in their order
+            low, wide = one.low, one.high - one.low
+            values[name] = [
+                [low + wide * next(share) for _ in range(one.size)] if one.size else low + wide * next(share)
+            ]
+        return values
     else:
-        applied = torch.full((rows,), p >= 1, device=device) if gate is None else gate
-    values, start = {"apply": applied}, 0
-    for name, interval in ranges.items():  # values are drawn in their order
+        shares = shares.numpy()
+        values = {"apply": np.array([p >= 1] * rows if gate is None else gate.tolist(), bool)}
+    start = 0
+    for name, interval in ranges.items():
         low, wide, end = interval.low, interval.high - interval.low, start + rows * (interval.size or 1)
-        if not is_single:
-            value = low + wide * shares[start:end]
-            values[name] = value.reshape(rows, interval.size) if interval.size else value
-        elif interval.size:
-            values[name] = [[low + wide * share for share in shares[start:end]]]
-        else:
-            values[name] = [low + wide * shares[start]]
+        value = low + wide * shares[start:end]
+        values[name] = value.reshape(rows, interval.size) if interval.size else value
         start = end
     return values if rows == count else {name: value[[0] * count] for name, value in values.items()}

@@ -229,13 +229,14 @@ class SampleTransform(KeepsCamera, nn.Module):
             camera = camera_of_images(named, camera, self.needs_camera, self._name)
         form = form_of(sample, camera, fields, self._calls.revision)
         if form is not None and (known := self._calls.plans.entry((), form)) is not None:
-            batch = Batch(known[2], sample, one_or_batch(camera), predicted)
+            plan: SamplePlan = known[2]
+            batch = Batch(plan, sample, camera[0] if plan.of_one else camera, predicted)
         else:
             batch = self._new_batch(sample, camera, fields, predicted)
             is_kept = all(v is sample[n] for n, v in batch.values.items())
             if form is not None and is_kept and batch.camera.intrinsics.device == camera.intrinsics.device:
                 self._calls.plans((), form, lambda: batch.plan)
-        if "K" in batch.plan.fields.values():
+        if batch.plan.has_matrices:
             self._check_matrices(batch, sample)
         return batch
 
@@ -252,6 +253,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             name: t for name, (_, value) in named.items() for t in (value if isinstance(value, list) else [value])
         }
         check_devices(owner, **tensors)
+        of_one = isinstance(camera, Camera) and camera.batch_shape == (1,)
         device, camera = next((t.device for t in tensors.values()), torch.device("cpu")), one_or_batch(camera)
         if device.type == "cpu" and are_free():
             warn_if_missing()
@@ -263,7 +265,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         flags = dict.fromkeys(["image_valid", *(f"{name}_valid" for name, kind in kinds.items() if kind in IMAGES)])
         masks = [key for key in flags if sample.get(key) is not None or (self.valid_mask and key == "image_valid")]
         calls = Kept() if are_free(*tensors.values()) else None
-        plan = SamplePlan(kinds, batched, count, masks, self.mask_fill, calls)
+        plan = SamplePlan(kinds, batched, count, masks, self.mask_fill, calls, of_one, "K" in kinds.values())
         return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, True)
 
     def _check_matrices(self, batch: Batch, sample: Sample) -> None:
@@ -313,25 +315,27 @@ class SampleTransform(KeepsCamera, nn.Module):
         """Return the sample with all that moves by a change, what is valid of it, the rotation and the camera."""
         plan, values, _, checked = batch
         moved, batched, mirroring = dict(sample), plan.batched, self.mirroring
-        if "K" in plan.fields.values():
+        if plan.has_matrices:
             check_targets(plan.fields, change, self._name)
-        options = {"mask_fill": self.mask_fill, "lateral": mirroring.lateral if mirroring else 0}
         together = {} if "image_valid" in plan.masks else plan.together(change, values)
+        options = None
         for name, kind in plan.fields.items():
-            value: Any = values[name]
             valid: Any
             if name in together:
                 moved[name], valid = together[name]
-            elif isinstance(value, list):
-                pairs = [move(change.row(i), kind, v.unsqueeze(0), options) for i, v in enumerate(value)]
-                moved[name] = [rows.squeeze(0) for rows, _ in pairs]
-                valid = [rows.squeeze(0) for _, rows in pairs if rows is not None] or None
             else:
-                if not checked:
-                    KINDS[kind].check(value, name, self._name)
-                rows, valid = move(change, kind, plan.rows(value), options)
-                moved[name] = rows if batched else rows.squeeze(0)
-                valid = valid if batched or valid is None else valid.squeeze(0)
+                value: Any = values[name]
+                options = options or {"mask_fill": self.mask_fill, "lateral": mirroring.lateral if mirroring else 0}
+                if isinstance(value, list):
+                    pairs = [move(change.row(i), kind, v.unsqueeze(0), options) for i, v in enumerate(value)]
+                    moved[name] = [rows.squeeze(0) for rows, _ in pairs]
+                    valid = [rows.squeeze(0) for _, rows in pairs if rows is not None] or None
+                else:
+                    if not checked:
+                        KINDS[kind].check(value, name, self._name)
+                    rows, valid = move(change, kind, plan.rows(value), options)
+                    moved[name] = rows if batched else rows.squeeze(0)
+                    valid = valid if batched or valid is None else valid.squeeze(0)
             if valid is not None:
                 flags = sample.get(f"{name}_valid")
                 moved[f"{name}_valid"] = (

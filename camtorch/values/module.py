@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, ParamSpec, TypeVar, cast
@@ -31,7 +32,7 @@ _KINDS = {"_own": dict, **{name: type(value) for name, value in _BARE.items() if
 
 def _containers() -> dict[str, Any]:
     """Return the empty dicts and sets of a new module."""
-    return {name: kind() for name, kind in _KINDS.items()}
+    return dict(zip(_KINDS, map(operator.call, _KINDS.values()), strict=True))  # no loop of Python
 
 
 class UnsharedState(nn.Module):

@@ -6,7 +6,6 @@ import functools
 import math
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -29,6 +28,10 @@ from camtorch.warp.sampling import PADDINGS, SHRINKS, SURELY, Options, Sampler
 Label = Literal["pixels", "boxes", "rays", "columns", "pose", "rotation vectors"]
 """What moves beside images: pixels, boxes, directions and points of the camera frame, or columns of such in a matrix,
 of which those of a pose begin with a rotation; or rotation vectors."""
+MovedField = tuple[Tensor, Tensor | None]
+"""A value after a move, and which of it is valid, if it has validity."""
+Placed = Callable[[Tensor, int], MovedField]
+"""Has C read a value, and returns its results; the number is the step from one camera's turn to the next one's."""
 Sizes = tuple[tuple[int, int], tuple[int, int]]  # (height, width) of the source's image, and of the target's
 
 _FORMS = {"pose": structs.POSE, "rotation vectors": structs.ROTATION_VECTORS}  # others are rays
@@ -77,7 +80,23 @@ def call_for(
     given = sizes, dtype, tolerance, antialias is None, batched
     forms = [(t.shape, t.stride(), t.dtype, how) for t, how in zip(values, hows, strict=True)]
     calls: Kept = _calls.__dict__.setdefault("kept", Kept(4))
-    return calls((), (*given, *forms), lambda: SampleCall.of(SampleForm(*given, count, values, hows)))
+
+    def made() -> SampleCall | None:
+        n, m = (math.ceil(side / structs.STEP) for side in sizes[1])
+        if min(n, m) < FEWEST or (n + 5) * (m + 5) > MOST_KEPT:  # too small for a lattice, or too large to be kept
+            return None
+        for value, how in zip(values, hows, strict=True):
+            if not isinstance(how, Sampler):
+                if torch.promote_types(value.dtype, dtype) != dtype:
+                    return None
+                continue
+            image = _as_images(value, batched)
+            result = maker(image, count, sizes[1])()
+            if 0 in result.shape or not takes(image.dtype, how.mode) or not is_quick(image, result, how.mode):
+                return None
+        return SampleCall(*given, count, values, hows)
+
+    return calls((), (*given, *forms), made)
 
 
 _calls = threading.local()  # a thread keeps calls of its last four forms, which have memory of their own
@@ -106,134 +125,161 @@ def _surely_keeps_size(back: NativeMove, sizes: Sizes) -> bool:
     return bool((total < SURELY * SHRINKS * step * np.maximum(count, 1)).all())
 
 
-@dataclass
-class SampleForm:
-    """The common form of samples that one call serves; see `call_for`."""
+def _as_images(value: Tensor, batched: bool) -> Tensor:
+    """Return an image or a mask as (B, C, H, W)."""
+    value = value if batched else value.unsqueeze(0)
+    return value if value.ndim == 4 else value.unsqueeze(1)
 
-    sizes: Sizes
-    dtype: torch.dtype
-    tolerance: float
-    decides: bool  # whether images that shrink are antialiased, which this call does not do
-    batched: bool
-    count: int
-    values: Sequence[Tensor]
-    hows: Sequence[Sampler | Label]
 
-    def images(self, value: Tensor) -> Tensor:
-        """Return an image or a mask as (B, C, H, W)."""
-        value = value if self.batched else value.unsqueeze(0)
-        return value if value.ndim == 4 else value.unsqueeze(1)
+def _image_maker(value: Tensor, batched: bool, make: Callable[[], Tensor]) -> Callable[[], Tensor]:
+    """Return a function that makes an empty tensor of the dims of `value`; make: one of (B, C, H, W)."""
+    is_image = value.ndim == 3 + batched
 
-    def takes(self, value: Tensor, how: Sampler | Label) -> bool:
-        """Whether a call takes a value: not images without pixels, or with strides that are slow to read."""
-        if not isinstance(how, Sampler):
-            return torch.promote_types(value.dtype, self.dtype) == self.dtype
-        image = self.images(value)
-        result = maker(image, self.count, self.sizes[1])()
-        return 0 not in result.shape and takes(image.dtype, how.mode) and is_quick(image, result, how.mode)
+    def made() -> Tensor:
+        result = make() if is_image else make().squeeze(1)
+        return result if batched else result.squeeze(0)
 
-    def maker(self, value: Tensor) -> Callable[[], Tensor]:
-        """Return a function that makes an empty tensor for the result of an image or a mask."""
-        make, is_image = maker(self.images(value), self.count, self.sizes[1]), value.ndim == 3 + self.batched
-
-        def made() -> Tensor:
-            result = make() if is_image else make().squeeze(1)
-            return result if self.batched else result.squeeze(0)
-
-        like = made()
-        if like.nbytes >= memory.LEAST:
-            return made
-        return functools.partial(torch.empty_strided, like.shape, like.stride(), dtype=like.dtype, device="cpu")
+    like = made()
+    if like.nbytes >= memory.LEAST:
+        return made
+    return functools.partial(torch.empty_strided, like.shape, like.stride(), dtype=like.dtype, device="cpu")
 
 
 class SampleCall:
-    """`Together` of geometry.h, with all that samples of one form have in common."""
+    """`Together` of geometry.h for samples of one form.
 
-    @classmethod
-    def of(cls, form: SampleForm) -> SampleCall | None:
-        """Return the call; None if a lattice would be too small or too large, or a value does not fit."""
-        n, m = (math.ceil(side / structs.STEP) for side in form.sizes[1])
-        if min(n, m) < FEWEST or (n + 5) * (m + 5) > MOST_KEPT:  # too small for a lattice, or too large to be kept
-            return None
-        return cls(form) if all(map(form.takes, form.values, form.hows)) else None
+    What they have in common is written once, when the call is made. Each run writes what a draw changes: both cameras,
+    the rotation, and where values and results lie.
+    """
 
-    def __init__(self, form: SampleForm):
-        sizes, dtype, count, self._sizes = form.sizes, form.dtype, form.count, form.sizes
-        samplers = [how for how in form.hows if isinstance(how, Sampler)]
-        probes = kept_probes(range(sizes[1][0]), sizes[1][1], dtype)
+    def __init__(
+        self,
+        sizes: Sizes,
+        dtype: torch.dtype,
+        tolerance: float,
+        decides: bool,
+        batched: bool,
+        count: int,
+        values: Sequence[Tensor],
+        hows: Sequence[Sampler | Label],
+    ):
+        """Take the arguments of `call_for`; decides: whether images that shrink are antialiased, unlike here."""
+        self._sizes, self._dtype, self._count, self._batched = sizes, dtype, count, batched
+        samplers = [how for how in hows if isinstance(how, Sampler)]
         padding = PADDINGS[max((PADDINGS.index(how.padding_mode) for how in samplers), default=0)]
         with torch.inference_mode(False):
-            self._lattices = Lattices(probes, sizes[1], sizes[0], form.tolerance, padding, count)
-        images, moving = len(samplers), sum(how in ("pixels", "boxes") for how in form.hows)
+            probes = kept_probes(range(sizes[1][0]), sizes[1][1], dtype)
+            self._lattices = Lattices(probes, sizes[1], sizes[0], tolerance, padding, count)
+        images, moving = len(samplers), sum(how in ("pixels", "boxes") for how in hows)
         self._jobs, pixels = (structs.Job * images)(), (structs.Move * moving)()
-        vectors = (structs.Turned * (len(form.hows) - images - moving))()
+        vectors = (structs.Turned * (len(hows) - images - moving))()
         call = self._call = structs.Together(job_count=images, move_count=moving, turned_count=len(vectors))
         call.jobs, call.moves, call.turned = (call.keep(array) for array in (self._jobs, pixels, vectors))
-        jobs, moves, turns = iter(self._jobs), iter(pixels), iter(vectors)
-        # the structure of each value, and whether C reads the value itself, not a copy
-        self._slots = list[tuple[structs.Job | structs.Move | structs.Turned, bool]]()
-        self._makers = list[Callable[[], Tensor]]()  # of images
-        self._tiles = 1
-        for value, how in zip(form.values, form.hows, strict=True):
-            slot: structs.Job | structs.Move | structs.Turned
-            if isinstance(how, Sampler):
-                slot = job = next(jobs)
-                image = form.images(value)
-                result = maker(image, count, sizes[1])()
-                fill = how.fill * image.shape[1] if len(how.fill) == 1 else how.fill
-                describe(job, image, result, how.mode, how.padding_mode, fill)
-                self._lattices.lay(job)
-                self._tiles = max(self._tiles, tiles_of(result[:1]))
-                self._makers.append(form.maker(value))
-            elif how in ("pixels", "boxes"):
-                slot, each = next(moves), 2 if how == "pixels" else 4
-                many = value.numel() // (each * count) if count else 0
-                slot.turn_strides[:], slot.cameras, (slot.height, slot.width) = (0, 3, 1), count, sizes[1]
-                slot.form = structs.ON_IMAGE if how == "pixels" else structs.BOXES
-                slot.count, slot.tile = many, max(many, 1)
-                slot.row_strides[:] = slot.result_strides[:] = each * many, each, 1
-            else:
-                slot, width = next(turns), value.shape[-1]
-                is_matrix = how in ("columns", "pose")
-                slot.strides[:], slot.count = ((1, width), width) if is_matrix else ((3, 1), value.numel() // 3)
-                slot.is_double, slot.form = dtype == torch.float64, _FORMS.get(how, structs.RAYS)
-            self._slots.append((slot, value.dtype == dtype and value.is_contiguous()))
         call.lattices = self._lattices.struct
-        self._back = call.lattices.move
+        self._back = call.lattices.move  # from the target to the source, which images are sampled by
         if count > 1:  # C samples images as soon as their lattice is made
             call.lattices.jobs, call.lattices.job_count = call.jobs, call.job_count
         else:
             self._back.next = None  # one thread makes the lattice, and needs no counter of those made
-        self._doubtful = [i for i, how in enumerate(form.hows) if how in ("boxes", "pose", "rotation vectors")]
-        self._dtype, self._count = dtype, count
-        ways = zip(form.values, form.hows, strict=True)
-        self._decides = form.decides and any(
-            isinstance(how, Sampler) and how.mode != "nearest" and value.dtype != torch.bool for value, how in ways
+        self._tiles = 1
+        jobs, moves, turns = iter(self._jobs), iter(pixels), iter(vectors)
+        self._places = [  # of each value: has C read it, and returns its results
+            self._image(next(jobs), value, how)
+            if isinstance(how, Sampler)
+            else self._pixels(next(moves), value, 2 if how == "pixels" else 4)
+            if how in ("pixels", "boxes")
+            else self._vectors(next(turns), value, how)
+            for value, how in zip(values, hows, strict=True)
+        ]
+        self._copied = [  # which values C reads from copies
+            i
+            for i, (value, how) in enumerate(zip(values, hows, strict=True))
+            if how in ("pixels", "boxes") and not (value.dtype == dtype and value.is_contiguous())
+        ]
+        self._doubtful = [i for i, how in enumerate(hows) if how in ("boxes", "pose", "rotation vectors")]
+        self._decides = decides and any(
+            isinstance(how, Sampler) and how.mode != "nearest" and value.dtype != torch.bool
+            for value, how in zip(values, hows, strict=True)
         )
+
+    def _image(self, job: structs.Job, like: Tensor, how: Sampler) -> Placed:
+        image = _as_images(like, self._batched)
+        make = maker(image, self._count, self._sizes[1])
+        result, make = make(), _image_maker(like, self._batched, make)
+        describe(
+            job,
+            image,
+            result,
+            how.mode,
+            how.padding_mode,
+            how.fill * image.shape[1] if len(how.fill) == 1 else how.fill,
+        )
+        self._lattices.lay(job)
+        self._tiles = max(self._tiles, tiles_of(result[:1]))
+
+        def placed(value: Tensor, step: int) -> MovedField:
+            result = make()
+            job.source, job.result = value.data_ptr(), result.data_ptr()
+            return result, None
+
+        return placed
+
+    def _pixels(self, move: structs.Move, like: Tensor, each: int) -> Placed:
+        dtype, back, many = self._dtype, self._back, like.numel() // (each * self._count) if self._count else 0
+        move.turn_strides[:], move.cameras, (move.height, move.width) = (0, 3, 1), self._count, self._sizes[1]
+        move.form = structs.ON_IMAGE if each == 2 else structs.BOXES
+        move.count, move.tile = many, max(many, 1)
+        move.row_strides[:] = move.result_strides[:] = each * many, each, 1
+
+        def placed(rows: Tensor, step: int) -> MovedField:
+            result = torch.empty(rows.shape, dtype=dtype, device="cpu")
+            valid = torch.empty(rows.shape[:-1], dtype=torch.bool, device="cpu")
+            move.from_, move.to, move.turns = back.to, back.from_, back.turns
+            move.turn_strides[0] = step
+            move.rows, move.results, move.valid = rows.data_ptr(), result.data_ptr(), valid.data_ptr()
+            return result, valid
+
+        return placed
+
+    def _vectors(self, turned: structs.Turned, like: Tensor, how: Label) -> Placed:
+        width, is_matrix, back = like.shape[-1], how in ("columns", "pose"), self._back
+        turned.strides[:], turned.count = ((1, width), width) if is_matrix else ((3, 1), like.numel() // 3)
+        turned.is_double, turned.form = self._dtype == torch.float64, _FORMS.get(how, structs.RAYS)
+
+        def placed(value: Tensor, step: int) -> MovedField:
+            result = value.clone()
+            turned.turn, turned.rows, turned.results = back.turns, value.data_ptr(), result.data_ptr()
+            return result, None
+
+        return placed
 
     def __call__(
         self, source: Native, target: Native, rotation: Tensor | None, values: Sequence[Tensor]
-    ) -> list[tuple[Tensor, Tensor | None] | None] | None:
+    ) -> list[MovedField | None] | None:
         """Move `values` of the form from one camera to another; also return which pixels and boxes are valid.
 
         None if the call does not serve. Those of boxes, poses and rotation vectors alone are None if some take more
         than their outline, or are none.
         """
-        dtype = self._dtype
-        if rotation is not None and (rotation.dtype != dtype or not rotation.is_contiguous()):
-            rotation = rotation.detach().to(dtype).contiguous()
+        dtype, turn, step = self._dtype, None, 0
+        if rotation is not None:
+            if rotation.dtype != dtype or not rotation.is_contiguous():
+                rotation = rotation.detach().to(dtype).contiguous()
+            turn, step = rotation.data_ptr(), 9 if rotation.ndim > 2 and len(rotation) > 1 else 0
         if self._decides:
             turns = None if rotation is None else rotation.mT
             if not _surely_keeps_size(NativeMove(target, source, turns, self._sizes[0], False), self._sizes):
                 return None
-        call, turn = self._call, None if rotation is None else rotation.data_ptr()
-        by_camera = 9 if rotation is not None and rotation.ndim > 2 and len(rotation) > 1 else 0
+        call, back = self._call, self._back
         target.add_table()
         if call.move_count:
             source.add_table()
-        back = self._back
-        back.from_, back.to, back.turns, back.turn_strides[0] = target.pointer, source.pointer, turn, by_camera
-        results, _alive = self._filled_in(source, target, turn, by_camera, values)
+        back.from_, back.to, back.turns, back.turn_strides[0] = target.pointer, source.pointer, turn, step
+        if self._copied:
+            values = [value.to(dtype).contiguous() if i in self._copied else value for i, value in enumerate(values)]
+        results: list[MovedField | None] = [
+            placed(value, step) for placed, value in zip(self._places, values, strict=True)
+        ]
         native, threads, jobs = loaded(), thread_count(), len(self._jobs)
         if self._count > 1 and jobs:
             run, counters = native.camtorch_lattices, self._lattices.counters
@@ -254,31 +300,6 @@ class SampleCall:
                 job.next = 0
                 spread(functools.partial(native.camtorch_sample, job), min(threads, self._tiles))
         return results
-
-    def _filled_in(
-        self, source: Native, target: Native, turn: int | None, by_camera: int, values: Sequence[Tensor]
-    ) -> tuple[list[tuple[Tensor, Tensor | None] | None], list[Tensor]]:
-        """Have the call read values and write results; return these, and what has to live as long as the call."""
-        results: list[tuple[Tensor, Tensor | None] | None] = []
-        given, makers, dtype = [], iter(self._makers), self._dtype
-        for value, (slot, is_plain) in zip(values, self._slots, strict=True):
-            valid = None
-            if isinstance(slot, structs.Job):
-                result = next(makers)()
-                slot.source, slot.result = value.data_ptr(), result.data_ptr()
-            elif isinstance(slot, structs.Turned):
-                result = value.clone()
-                slot.turn, slot.rows, slot.results = turn, value.data_ptr(), result.data_ptr()
-            else:
-                if not is_plain:
-                    value = value.to(dtype).contiguous()
-                    given.append(value)
-                result = torch.empty(value.shape, dtype=dtype, device="cpu")
-                valid = torch.empty(value.shape[:-1], dtype=torch.bool, device="cpu")
-                slot.from_, slot.to, slot.turns, slot.turn_strides[0] = source.pointer, target.pointer, turn, by_camera
-                slot.rows, slot.results, slot.valid = value.data_ptr(), result.data_ptr(), valid.data_ptr()
-            results.append((result, valid))
-        return results, given
 
     def _follow(self, flags: int, source: Native, target: Native) -> int:
         """Compute limits that the call lacked: of cameras for the lattice, or for pixels, whose flags it returns."""
