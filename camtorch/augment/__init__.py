@@ -22,9 +22,8 @@ from camtorch.augment.edits import (
     VerticalFlip,
 )
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.face_model import face_points
 from camtorch.augment.fields import from_pitch_yaw, to_pitch_yaw
-from camtorch.augment.landmarks import LANDMARKS
+from camtorch.augment.landmarks import LANDMARKS, face_points
 from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount
 from camtorch.augment.ranges import Range

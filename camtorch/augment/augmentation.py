@@ -13,10 +13,9 @@ from typing_extensions import Unpack
 
 from camtorch.augment.change import Change, Part, by_kinds, check_sizes, one_or_batch
 from camtorch.augment.devices import Elsewhere, remember_camera, twin_of
-from camtorch.augment.fields import BOXES, FRONT_ENDS, Named, as_corners
+from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.matrices import Guess
-from camtorch.augment.place import PLACE, put_place
 from camtorch.augment.ranges import Range, draw
 from camtorch.augment.reading import moving
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
@@ -26,6 +25,7 @@ from camtorch.evaluate.door import has_tangent, keeps_graph, may_look
 from camtorch.evaluate.tensors import are_known, are_numbers, known_false, known_true
 from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_part, as_whole, hinting, warn
 from camtorch.values.module import typed_as
+from camtorch.warp.views import place_of
 from camtorch.warp.warp import Warp
 
 _FEW = 2 / 3  # of what an image shows of its own camera: with less than that, on average, it warns
@@ -380,12 +380,13 @@ class Augmentation(SampleTransform):
                 f"for each{f', {one}' if change.count == 1 else ''}"
             )
         if not torch.compiler.is_compiling():
-            self._calls.is_first, self._calls.last = "rotation" not in plan.fields, change
-            if count and not self._calls.warned and "image" in plan.fields.values():
+            calls = self._calls
+            calls.is_first, calls.last = "rotation" not in plan.fields, change
+            if count and not calls.warned and "image" in plan.fields.values():
                 self.tell_of_empty_images(change.host.source if isinstance(change, Elsewhere) else camera)
         moved = self._moved(sample, batch, change)
         if self.place or PLACE in sample:
-            put_place(sample, moved, self._name)
+            _put_place(sample, moved, self._name)
         if isinstance(change, Elsewhere) and isinstance(moved.get("camera"), Camera):
             remember_camera(moved["camera"], change.host.target if plan.batched else change.host.single)
         return moved, change
@@ -456,3 +457,16 @@ def _are_alike(value: Any) -> bool:
         return False
     same = value == value[:1]
     return same.size > 0 and bool(same.all()) if isinstance(same, np.ndarray) else known_true(same)
+
+
+def _put_place(sample: Mapping[str, Any], moved: dict[str, Any], owner: str) -> None:
+    """Put `crop_place` into a moved sample, by its camera and by all that turned it; see `ct.views.crop_place`."""
+    if PLACE in sample and not ("rotation" in sample and "camera" in moved):
+        raise ValueError(
+            f"{owner}: a sample with {PLACE} must have the rotation and the camera that came with it, as it follows "
+            f"from them; got {', '.join(sample)}. Leave {PLACE} out, or keep them"
+        )
+    rotation = moved["rotation"]
+    rotation = torch.stack(rotation) if isinstance(rotation, list) else rotation
+    camera = one_or_batch(moved["camera"])
+    moved[PLACE] = place_of(camera, rotation.to(camera.intrinsics))

@@ -22,7 +22,6 @@ from camtorch.values.module import remade
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
 from camtorch.warp.boxes import corners_of, in_order
 from camtorch.warp.panorama import seam_of
-from camtorch.warp.samples import natives_of
 from camtorch.warp.sampling import Mode, Options
 from camtorch.warp.shifted import ShiftedWarp
 from camtorch.warp.warp import Warp
@@ -113,13 +112,6 @@ class Part:
     def image_size(self) -> tuple[int, int]:
         """(height, width) after the change."""
         return self.moves.image_size if isinstance(self.moves, LazyWarp) else self.target.size_for("Warp")
-
-    def natives(self) -> tuple[Native, Native, Tensor | None] | None:
-        """Return both cameras and the rotation for native code; None if there is more, such as light."""
-        if isinstance(self.moves, LazyWarp):
-            start, end = self.moves.start, self.moves.native
-            return None if start is None or end is None else (start, end, self.moves.rotation)
-        return None if self.moves is None or self.shades or self.light is not None else natives_of(self.warp)
 
     def with_warps(self, change: Callable[[Warp], Warp]) -> Part:
         """Return the part with each of its warps changed."""

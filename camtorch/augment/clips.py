@@ -8,9 +8,8 @@ from typing import Any
 
 import torch
 
-from camtorch.augment.fields import OWN, kind_of
+from camtorch.augment.fields import OWN, PLACE, kind_of
 from camtorch.augment.matrices import check_alike
-from camtorch.augment.place import PLACE
 from camtorch.cameras.camera import Camera
 
 

@@ -1,19 +1,38 @@
-"""Batches for a DataLoader of samples with cameras, and with labels whose number differs."""
+"""Batches for a DataLoader of samples with cameras, and with labels whose number differs.
+
+Workers send them in shared memory that is used again or, if small, within the message. Memory that is new to a process
+takes as long to get as images take to be augmented; and every tensor that torch sends has a file of its own, for which
+the other process has to ask.
+"""
 
 from __future__ import annotations
 
 import functools
+import mmap
+import os
+import pickle
+import threading
+import weakref
 from collections.abc import Callable, Sequence
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.multiprocessing import get_sharing_strategy
+from torch.multiprocessing.reductions import reduce_tensor
 
-from camtorch.augment.sending import stacked, within_message
-from camtorch.evaluate.door import COLLATE_FUNCTIONS, collate_by
+from camtorch.evaluate.door import COLLATE_FUNCTIONS, NO_TORCH_FUNCTION, collate_by
 from camtorch.evaluate.tensors import in_worker
+from camtorch.native.memory import LIMIT, tensor_on
 from camtorch.values.arguments import is_list
+
+_SMALL = 1 << 16
+"""Bytes below which a tensor goes within the message."""
+_MOST = 32
+"""Blocks that wait, and blocks that others have: for those who keep more batches than that, memory is torch's own."""
+_HOME, _AWAY, _LOST = 0, 1, 2
 
 
 def collate(samples: Sequence[object]) -> object:
@@ -44,7 +63,7 @@ def _tensors(batch: Sequence[Tensor], *, collate_fn_map: Any = None) -> Tensor |
         batch = [tensor.detach() for tensor in batch]
     if len({tensor.shape for tensor in batch}) > 1:
         return list(batch)
-    sent = stacked(batch)
+    sent = _stacked(batch)
     return COLLATE_FUNCTIONS[Tensor](batch, collate_fn_map=collate_fn_map) if sent is None else sent
 
 
@@ -53,4 +72,151 @@ def _arrays(batch: Sequence[np.ndarray], *, collate_fn_map: Any = None) -> Tenso
 
 
 def _others(function: Callable[..., Any], batch: Sequence[Any], *, collate_fn_map: Any = None) -> Any:
-    return within_message(function(batch, collate_fn_map=collate_fn_map))
+    return _within_message(function(batch, collate_fn_map=collate_fn_map))
+
+
+class _Sent(Tensor):
+    """A batch in a worker, which comes out of the DataLoader as a plain tensor; so does what is computed from it."""
+
+    __torch_function__ = NO_TORCH_FUNCTION
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return self.as_subclass(Tensor).__reduce_ex__(protocol)  # to files and the like
+
+    def __deepcopy__(self, memo: Any) -> Tensor:
+        return self.as_subclass(Tensor).__deepcopy__(memo)  # type: ignore[no-any-return]
+
+
+class _Block:
+    """Shared memory, whose last byte is set if another process has it, or has had it before a fork."""
+
+    def __init__(self, size: int):
+        self.size, self.forks = size, _forks
+        self.file = os.memfd_create("camtorch")
+        weakref.finalize(self, os.close, self.file).atexit = False
+        os.ftruncate(self.file, size + 1)
+        self.memory = _mapped(os.getpid(), self.file, size)
+
+    def back(self, place: int) -> None:
+        """Take a block back of which no tensor of this process is left."""
+        del _held[place]
+        _away.append(self)
+
+
+_held: dict[int, _Block] = {}
+"""Blocks in which this process has a tensor, by their addresses."""
+_away: list[_Block] = []
+"""Blocks in which another process may have a tensor."""
+_idle: list[_Block] = []
+_lock = threading.Lock()  # of the lists; `back` goes without it: a tensor may die wherever Python collects garbage
+_forks = 0
+
+
+def _within_message(value: Any) -> Any:
+    """Return a worker's message, with small tensors by value; elsewhere return it as it is."""
+    if not in_worker():
+        return value
+    if _is_plain(value):
+        return value.as_subclass(_Sent)
+    if isinstance(value, nn.Module):
+        ForkingPickler.register(type(value), lambda module: (pickle.loads, (pickle.dumps(module),)))
+    return value
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether it is a tensor that its bytes, dtype and shape say all of."""
+    if type(value) is not Tensor or value.layout != torch.strided or not value.is_cpu:
+        return False
+    return not (value.requires_grad or value.is_quantized or value.is_conj() or value.is_neg())
+
+
+def _stacked(batch: Sequence[Tensor]) -> Tensor | None:
+    """Return tensors of one shape as a batch ready to be sent; None outside of workers, and if torch's own way does."""
+    first = batch[0]
+    if not in_worker() or any(t.dtype != first.dtype or not _is_plain(t) for t in batch):
+        return None
+    like = torch.empty(len(batch), *first.shape, dtype=first.dtype, device="meta")
+    if like.nbytes < _SMALL:
+        return torch.stack(list(batch)).as_subclass(_Sent)
+    block = _block(like.nbytes)
+    if block is None:
+        return None
+    place = torch.frombuffer(block.memory, dtype=torch.uint8).data_ptr()
+    _held[place] = block
+    result = tensor_on(block.memory, like.dtype, like.shape, like.stride(), functools.partial(block.back, place))
+    return torch.stack(list(batch), out=result).as_subclass(_Sent)
+
+
+def _block(size: int) -> _Block | None:
+    """Return a free block of `size` bytes; None if the system or the user requires torch's own way of sharing."""
+    if get_sharing_strategy() == "file_system" or not _is_open(os.getppid()):
+        return None
+    with _lock:
+        for block in [block for block in _away if block.memory[-1] != _AWAY]:
+            _away.remove(block)
+            _idle.append(block)
+        _idle[:] = [block for block in _idle if block.memory[-1] == _HOME and block.forks == _forks]
+        for i in reversed(range(len(_idle))):
+            if _idle[i].size == size:
+                return _idle.pop(i)
+        while len(_idle) >= _MOST or sum(block.size for block in _idle) > LIMIT:
+            del _idle[0]
+    try:
+        return _Block(size) if len(_away) < _MOST else None
+    except OSError:
+        return None
+
+
+@functools.cache
+def _is_open(process: int) -> bool:
+    """Whether files of such a process can be opened by others of the same user, as Linux has it."""
+    try:
+        return hasattr(os, "memfd_create") and bool(os.listdir(f"/proc/{process}/fd"))
+    except OSError:
+        return False
+
+
+def _mapped(process: int, file: int, size: int) -> mmap.mmap:
+    with open(f"/proc/{process}/fd/{file}", "r+b", buffering=0) as opened:
+        return mmap.mmap(opened.fileno(), size + 1)
+
+
+def _reduced(sent: _Sent) -> tuple[Callable[..., Tensor], tuple[Any, ...]]:
+    """Return the function and arguments by which another process makes the tensor."""
+    block, what = _held.get(sent.data_ptr()), (sent.dtype, tuple(sent.shape))
+    if sent.is_contiguous() and not sent.requires_grad:
+        if block is not None and block.memory[-1] == _HOME:
+            block.memory[-1] = _AWAY
+            return _arrived, (os.getpid(), block.file, block.size, *what)
+        if sent.nbytes < _SMALL:
+            return _unpacked, (sent.reshape(-1).view(torch.uint8).numpy().tobytes(), *what)
+    reduced: tuple[Callable[..., Tensor], tuple[Any, ...]] = reduce_tensor(
+        sent.detach().as_subclass(Tensor).clone().requires_grad_(sent.requires_grad)
+    )
+    return reduced
+
+
+def _arrived(process: int, file: int, size: int, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+    memory, forks = _mapped(process, file, size), _forks
+
+    def died() -> None:
+        memory[-1] = _HOME if forks == _forks else _LOST
+
+    return tensor_on(memory, dtype, shape, torch.empty(shape, device="meta").stride(), died)
+
+
+def _unpacked(data: bytes, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+    if not data:
+        return torch.empty(shape, dtype=dtype, device="cpu")
+    return torch.frombuffer(bytearray(data), dtype=dtype).view(shape)
+
+
+def _forked() -> None:
+    """Forget blocks that two processes have from now on: neither may write to them."""
+    global _forks
+    _forks += 1
+
+
+ForkingPickler.register(_Sent, _reduced)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_forked, after_in_parent=_forked, after_in_child=_forked)  # threads go on in between

@@ -302,6 +302,8 @@ KINDS = {
 BOXES = "boxes", *_PLACED
 ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
 ALIASES |= {name: "K" for name in NAMES if name != "K"}
+PLACE = "crop_place"
+"""The place of a sample's crop, which follows its camera and rotation through all augmentations."""
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
 
 

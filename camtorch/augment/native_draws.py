@@ -141,7 +141,7 @@ class Start:
     def warp(self, values: Mapping[str, Any], base: Camera, options: Options) -> LazyWarp:
         """Return the warp to cameras like `base` of values (B,) and (B, size), or numbers and lists for one."""
         call, native, names = structs.Draws.from_buffer_copy(self._call), self._native, self.names
-        given: Any = [values[name] for name in names]
+        given: Any = [*map(values.__getitem__, names)]
         is_one, rows, (of_numbers, dtype) = not self._rows, self._rows or 1, self._kinds
         if given and isinstance(given[0], np.ndarray):
             is_one, rows = False, self._rows or len(given[0])
@@ -190,13 +190,11 @@ class Start:
             k = numbers[13 * rows : (13 + call.count) * rows].reshape(*several, call.count)
         if several:
             intrinsics = intrinsics.reshape(rows, 4)
-        made = None
-        if left or not self._is_flat:
-            pass
-        elif self._knows or (not self._moves and native.cameras == rows):
+        made, serves = None, self._is_flat and not left
+        if serves and (self._knows or (not self._moves and native.cameras == rows)):
             lenses = partial(self._lenses, numbers, rows) if self._knows else lambda _: native.lenses
             made = Native.made(native, call.made, (call, kept, self), lenses)
-        elif is_one:
+        elif serves and is_one:
             made = single_native(model_of(self.base), torch.from_numpy(intrinsics), torch.from_numpy(k))
         return LazyWarp(base, intrinsics, k, self.size, rotation, options, self.before, made, filled)
 

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.fields import ALIASES, IMAGES, KINDS, OWN, kind_of
+from camtorch.augment.fields import ALIASES, IMAGES, KINDS, OWN, PLACE, kind_of
 from camtorch.augment.front_end import FrontEnd, check_front_end
-from camtorch.augment.place import PLACE
 from camtorch.augment.sample import Sample, Single
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept

@@ -1,10 +1,11 @@
-"""The plan of a form of samples: which fields move, whether there is a dim B, and the call of C for most of them."""
+"""The form of samples, and its plan: which fields move, whether there is a dim B, and the call of C for most."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from threading import get_ident
 from typing import Any, NamedTuple
 
 import torch
@@ -14,19 +15,46 @@ from camtorch.augment.change import Change, LazyWarp, Part
 from camtorch.augment.fields import KINDS, field_of, in_range
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.tensors import are_numbers, known_true
+from camtorch.evaluate.tensors import are_free, are_numbers, known_true
 from camtorch.native.library import native_available
 from camtorch.native.structs import EDGE_POINTS
+from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import thread_count
 from camtorch.warp.affine import MirrorWarp
 from camtorch.warp.boxes import along_edges, around, corners_of, in_order
-from camtorch.warp.samples import Label, call_for
+from camtorch.warp.samples import Label, MovedField, call_for, natives_of
 from camtorch.warp.sampling import Options, Sampler
 from camtorch.warp.warp import Warp
 
-MovedField = tuple[Tensor, Tensor | None]
-"""A field of a sample as it comes out, and which of it is valid, if it has validity."""
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
+
+
+def form_of(
+    sample: Mapping[str, Any], camera: object, fields: Mapping[str, str], revision: object
+) -> tuple[Any, ...] | None:
+    """Return all that a plan depends on; None if a plan cannot be kept.
+
+    A plan cannot be kept if the camera is a `Mixed`, tensors are traced, or a field is, for example, a list.
+
+    revision: that of the transform, which changes with its options.
+    """
+    if not isinstance(camera, Camera) or camera.is_mixed:
+        return None
+    is_free = are_free(*[value for value in sample.values() if isinstance(value, Tensor)])
+    if not is_free and not are_free():
+        return None
+    intrinsics, distortion = camera.intrinsics, camera.distortion
+    # each thread has calls of its own
+    parts: list[Any] = [revision, get_ident(), type(sample), type(camera), camera.image_size]
+    parts += intrinsics.shape, intrinsics.dtype, intrinsics.device, distortion.shape
+    for name, value in sample.items():
+        if isinstance(value, Tensor):
+            parts += name, type(value), value.shape, value.stride(), value.dtype, value.device
+        elif value is None or isinstance(value, (str, int, float, Camera)):
+            parts += name, type(value)
+        else:
+            return None
+    return *parts, is_free, *fields.items()
 
 
 @dataclass(frozen=True)
@@ -57,16 +85,22 @@ class SamplePlan:
             return {}
         if not native_available():
             return self._pixels_at_once(part, values)
-        if (natives := part.natives()) is None:
-            return {}
-        source, target, rotation = natives
+        source: Native | None
+        target: Native | None
         options, turns, is_turn = moves.options, None, False
-        if self.count > 1 or not isinstance(moves, LazyWarp):
-            if max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != self.count:
-                return {}
+        if isinstance(moves, LazyWarp):
+            source, target, rotation, size = moves.start, moves.native, moves.rotation, moves.image_size
+        elif part.shades or part.light is not None or (natives := natives_of(moves)) is None:
+            return {}
         else:
+            (source, target, rotation), size = natives, moves.target.size_for("Warp")
+        if source is None or target is None:
+            return {}
+        if self.count == 1 and isinstance(moves, LazyWarp):
             turns, is_turn = source.dtype, moves.is_turn
-        sizes = part.camera.size_for("Warp"), part.image_size
+        elif max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != self.count:
+            return {}
+        sizes = part.camera.size_for("Warp"), size
         settings = sizes, source.dtype, turns, is_turn, thread_count(), *options.values()
         if (known := calls.entry((), settings)) is None:
             ways = self._ways(values, options, turns, is_turn)

@@ -1,17 +1,11 @@
-"""What is read of a sample before it moves: its fields by their kinds, checked, its cameras, and its form."""
+"""What is read of a sample before it moves: its fields by their kinds, checked, and its cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from threading import get_ident
 from typing import Any
 
-from torch import Tensor
-
-from camtorch.augment.fields import IMAGES, KINDS, OWN, Named, as_tensor, check_shape, kind_of, warn_of_numbers
-from camtorch.augment.place import PLACE
-from camtorch.cameras.camera import Camera
-from camtorch.evaluate.tensors import are_free
+from camtorch.augment.fields import IMAGES, KINDS, OWN, PLACE, Named, as_tensor, check_shape, kind_of, warn_of_numbers
 from camtorch.values.dtypes import check_averaged
 from camtorch.warp.warp import as_sized
 
@@ -116,31 +110,3 @@ def _check_size(field: str, shape: tuple[int, ...], name: str, size: tuple[int, 
         f"{owner}: {field} must be of {name}'s image_size {size}; got {shape[-2:]} (height, width). camera.resize, "
         ".crop and .pad give the camera of an edited image"
     )
-
-
-def form_of(
-    sample: Mapping[str, Any], camera: object, fields: Mapping[str, str], revision: object
-) -> tuple[Any, ...] | None:
-    """Return all that a plan depends on; None if a plan cannot be kept.
-
-    A plan cannot be kept if the camera is a `Mixed`, tensors are traced, or a field is, for example, a list.
-
-    revision: that of the transform, which changes with its options.
-    """
-    if not isinstance(camera, Camera) or camera.is_mixed:
-        return None
-    is_free = are_free(*[value for value in sample.values() if isinstance(value, Tensor)])
-    if not is_free and not are_free():
-        return None
-    intrinsics, distortion = camera.intrinsics, camera.distortion
-    # each thread has calls of its own
-    parts: list[Any] = [revision, get_ident(), type(sample), type(camera), camera.image_size]
-    parts += intrinsics.shape, intrinsics.dtype, intrinsics.device, distortion.shape
-    for name, value in sample.items():
-        if isinstance(value, Tensor):
-            parts += name, type(value), value.shape, value.stride(), value.dtype, value.device
-        elif value is None or isinstance(value, (str, int, float, Camera)):
-            parts += name, type(value)
-        else:
-            return None
-    return *parts, is_free, *fields.items()

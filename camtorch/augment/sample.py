@@ -18,8 +18,8 @@ from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS, Named, is_b
 from camtorch.augment.keywords import check_arguments
 from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess, camera_of, check_agrees, check_targets, refuse
-from camtorch.augment.plan import Batch, SamplePlan, move
-from camtorch.augment.reading import check_cameras, check_fields, check_one_size, form_of, moving
+from camtorch.augment.plan import Batch, SamplePlan, form_of, move
+from camtorch.augment.reading import check_cameras, check_fields, check_one_size, moving
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept

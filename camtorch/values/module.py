@@ -297,16 +297,14 @@ def remade(module: Made, learns: bool = False, /, **changes: Any) -> Made:
         state.update(_containers())
         for name in module.memo_names:
             state[name] = Kept.__new__(Kept)  # without a call of Python
+        parameters, own = state["_parameters"], state["_own"]
         for name, tensor in tensors.items():
-            if tensor.shape[-1]:
-                is_one = type(tensor) is nn.Parameter  # as of most: what `fixed` would ask
-                tensor = tensor if is_one else fixed(tensor)
-                if is_one or is_parameter(tensor):
-                    state["_parameters"][name] = state["_own"][name] = tensor
-                else:
-                    made.put(name, _widen(tensor))
-            else:
+            if not tensor.shape[-1]:
                 made.put(name, tensor.detach() if tensor.requires_grad else tensor)
+            elif type(tensor) is nn.Parameter or is_parameter(tensor := fixed(tensor)):  # most are one
+                parameters[name] = own[name] = tensor
+            else:
+                made.put(name, _widen(tensor))
     for name in module.tensor_names if learns else ():
         if isinstance(its := getattr(made, name), nn.Parameter):
             its.requires_grad_(getattr(module, name).requires_grad)

@@ -3,6 +3,7 @@
 import copy
 import os
 import pickle
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -156,7 +157,7 @@ def test_what_a_child_has_of_a_batch_stays():
 
 
 def test_another_strategy_of_torchs_is_kept(monkeypatch):
-    monkeypatch.setattr("camtorch.augment.sending.get_sharing_strategy", lambda: "file_system")
+    monkeypatch.setattr(sys.modules["camtorch.augment.collate"], "get_sharing_strategy", lambda: "file_system")
     for _, batch in numbered(loader()):
         assert batch["image"].is_shared()
         assert not batch["number"].is_shared()
