@@ -61,7 +61,7 @@ class MirrorWarp(Warp):
         self._decides = antialias is None
         self._halvings: list[int] | None = None
 
-    def warped(self, images: Tensor, sampler: Sampler) -> Tensor:
+    def warped(self, images: Tensor, sampler: Sampler, route: Route | None = None) -> Tensor:
         """Return warped images; each one may be copied, resized, or halved and sampled, see `Way`."""
         smooth = sampler.mode != "nearest" and images.dtype != torch.bool
         called = torch.compiler.is_compiling() and not torch.onnx.is_in_onnx_export()
@@ -70,29 +70,29 @@ class MirrorWarp(Warp):
             cameras = self.source, self.target, self.rotation
             matrix = None if self.map is None else as_tensor(self.map)
             return compiled.warped(images, *cameras, self.tolerance, *options, matrix, _edited)
-        route = self.route(images)
+        route = route or self.route(images)
         ways = None if in_transform() else self._ways(sampler, smooth, route)
         if not ways:
-            return super().warped(images, sampler)
+            return super().warped(images, sampler, route)
         images = images.expand(len(ways), -1, -1, -1) if len(ways) > 1 else images
         if all(way == ways[0] for way in ways):
-            return self._made(images, ways[0], sampler)
+            return self._made(images, ways[0], sampler, route)
         result = self._empty(images)
         for way in dict.fromkeys(ways):
             rows = [i for i, other in enumerate(ways) if other == way]
             if way.move or way.box:
                 for i in rows:
-                    self._made(images[i : i + 1], way, sampler, out=result[i : i + 1])
+                    self._made(images[i : i + 1], way, sampler, route, out=result[i : i + 1])
                 continue
             index = torch.tensor(rows, device=images.device)
-            made = self._made(images[index], way, sampler, index)
+            made = self._made(images[index], way, sampler, route, index)
             for row, one in zip(rows, made, strict=True):  # unsigned integers have no index_put
                 result[row] = one
         return result
 
     def _depends(self, smooth: bool) -> bool:
         """Whether the ways depend on traced values."""
-        return self._decides and smooth and self.is_an_operator and not (self.source.is_mixed or self.target.is_mixed)
+        return self._decides and smooth and self.knows_operator
 
     def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[Way] | None:
         """Return the way of each row, or one for all; None to sample as any `Warp` does."""
@@ -104,7 +104,13 @@ class MirrorWarp(Warp):
         return [Way(sampler.padding_mode, k) for k in self._halvings] if any(self._halvings) else None
 
     def _made(
-        self, images: Tensor, way: Way, sampler: Sampler, rows: Tensor | None = None, out: Tensor | None = None
+        self,
+        images: Tensor,
+        way: Way,
+        sampler: Sampler,
+        route: Route,
+        rows: Tensor | None = None,
+        out: Tensor | None = None,
     ) -> Tensor:
         """Return images made in one way, of these rows or all; unless they are sampled they may be written to `out`."""
         if way.move:
@@ -132,11 +138,11 @@ class MirrorWarp(Warp):
             return made if out is None else out.copy_(made)
         sampler = sampler._replace(padding_mode=way.padding_mode)
         if rows is None and not way.halvings:
-            return super().warped(images, sampler)
+            return super().warped(images, sampler, route)
         images = self.lengthened(images)
         if way.halvings:
             images = _resized(images, [max(-(-side >> way.halvings), 1) for side in images.shape[-2:]])
-        where = self.positions(self.route(images), way.padding_mode)
+        where = self.positions(route, way.padding_mode)
         return render(images, where if rows is None else where.cameras(rows), *sampler)
 
     def _empty(self, images: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ast
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,7 @@ from camtorch.cameras.operators import CameraNumbers, opaque
 from camtorch.evaluate.kept import Kept
 from camtorch.native.sampler import layout
 from camtorch.values.arguments import broadcast_shapes
-from camtorch.warp.grid import locate, tabulate
+from camtorch.warp.grid import locate
 from camtorch.warp.sampling import Sampler, render
 
 
@@ -43,13 +43,9 @@ def positions(
     source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, padding: str
 ) -> tuple[Tensor, Tensor]:
     """Return the positions of all target pixels, planes (B or 1, 2, H', W'), and whether they are mapped."""
-    grid, mapped = tabulate(source, target, rotation, tolerance, padding=padding)
+    every = range(target.size_for("Warp")[0])
+    grid, mapped = locate(source, target, rotation, tolerance, False, every, padding).pixels[:2]
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
-
-
-def takes(images: Tensor, inputs: Sequence[Tensor]) -> bool:
-    """Whether compiled graphs call an operator for positions that depend on `inputs`: on the CPU, if nothing learns."""
-    return all(t.is_cpu and not (t.requires_grad and torch.is_grad_enabled()) for t in (images, *inputs))
 
 
 def warped(

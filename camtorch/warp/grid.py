@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial, reduce
 from typing import Any, NamedTuple, cast
@@ -17,9 +16,9 @@ from torch.autograd import Function
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.devices import sent
-from camtorch.evaluate.door import in_jit_trace, is_eager, keeps_graph, may_look, set_aside
+from camtorch.evaluate.door import is_eager, keeps_graph, may_look
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.tensors import are_free, are_plain, is_unknown
+from camtorch.evaluate.tensors import are_plain, is_unknown, known_true
 from camtorch.native import sampler
 from camtorch.native.library import native_available
 from camtorch.native.structs import (
@@ -121,17 +120,16 @@ class Lattice:
 
     @cached_property
     def pixels(self) -> Sampling:
-        """The positions of all pixels; torch.jit.trace records them as a constant, even if they are made there."""
-        with set_aside() if in_jit_trace() else nullcontext():
-            nodes, exact, cells = self.nodes, self.exact, self.cells
-            if self.smooth:
-                return Sampling(*_all_by_quintics(nodes, cells, self.size), None)
-            single = nodes.dtype == torch.float32 and self.done is None
-            if single and native_available() and is_eager(nodes, exact, cells):
-                grid, seen = _Pixels.apply(nodes, exact, cells, self.size)  # type: ignore[no-untyped-call]
-            else:
-                grid, seen = _pixel_by_pixel(nodes, exact, cells, self.size, self.done)
-            return Sampling(grid, seen, None)
+        """The positions of all pixels."""
+        nodes, exact, cells = self.nodes, self.exact, self.cells
+        if self.smooth:
+            return Sampling(*_all_by_quintics(nodes, cells, self.size), None)
+        single = nodes.dtype == torch.float32 and self.done is None
+        if single and native_available() and is_eager(nodes, exact, cells):
+            grid, seen = _Pixels.apply(nodes, exact, cells, self.size)  # type: ignore[no-untyped-call]
+        else:
+            grid, seen = _pixel_by_pixel(nodes, exact, cells, self.size, self.done)
+        return Sampling(grid, seen, None)
 
 
 class _Pixels(Function):
@@ -169,15 +167,15 @@ def _pixel_by_pixel(
     """Return positions (B, h, w, 2) of a lattice's pixels, and whether there are any, bool (B, h, w); by torch."""
     (height, width), (_, n, m) = size, cells.shape
     quintic = cells == CELL_QUINTIC
-    some_are = may_look(quintic) and bool(quintic.any())
-    all_are = some_are and bool(quintic.all())
+    all_are = known_true(quintic)
+    some_are = all_are or (may_look(quintic) and bool(quintic.any()))
     planes = interpolated(nodes if all_are else nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
     if some_are and not all_are:
         wide = quintic.repeat_interleave(STEP, 1).repeat_interleave(STEP, 2).unsqueeze(1)
         planes = torch.where(wide, interpolated(nodes, n, m), planes)
     blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))
     some = cells != CELL_EMPTY
-    if not (may_look(some) and bool(some.all())):
+    if not known_true(some):
         blocks.masked_fill_(~some[:, None, :, None, :, None], OUTSIDE)
     seen = some[:, :, None, :, None].expand(-1, -1, STEP, -1, STEP).flatten(3, 4).flatten(1, 2)
     camera, i, j = (cells >= 0).nonzero(as_tuple=True) if done is None else done.unbind()
@@ -200,16 +198,18 @@ def locate(
     rows: range,
     padding: str,
 ) -> Sampling | Lattice:
-    """Return where rows of a target sample the source's image: a lattice if that serves, else all positions."""
+    """Return where rows of a target sample the source's image: a lattice if that serves, else all positions.
+
+    Antialiased images need all, of a lattice or not.
+    """
+
+    def found(part: range) -> Sampling | Lattice:
+        lattice = on_lattice(source, target, rotation, tolerance, part, padding) if tolerance else None
+        return lattice or Sampling(*_tabulated(source, target, rotation, part), None)
+
     if not antialias:
-        if tolerance and not torch.compiler.is_compiling():
-            lattice = on_lattice(source, target, rotation, tolerance, rows, padding)
-            if lattice is not None:
-                return lattice
-            tolerance = 0.0
-        return Sampling(*tabulate(source, target, rotation, tolerance, rows, padding), None)
-    found = partial(tabulate, source, target, rotation, tolerance, padding=padding)
-    return scaled_rows(source, rows, target.size_for("Warp")[0], found)
+        return found(rows)
+    return scaled_rows(source, rows, target.size_for("Warp")[0], lambda part: found(part).pixels[:2])
 
 
 def scaled_rows(
@@ -222,30 +222,15 @@ def scaled_rows(
     return where if around == rows else where.part(slice(rows.start - around.start, rows.stop - around.start))
 
 
-@on_one_thread
-def tabulate(
-    source: Camera,
-    target: Camera,
-    rotation: Tensor | None,
-    tolerance: float = 0.0,
-    rows: range | None = None,
-    padding: str = "zeros",
-) -> tuple[Tensor, Tensor]:
-    """Return the sampling positions of a target's pixels, and which are mapped, see `Exact`; maybe by `on_lattice`."""
-    height, width = target.size_for("Warp")
-    rows = range(height) if rows is None else rows
-    like = _like(target)
+def _tabulated(source: Camera, target: Camera, rotation: Tensor | None, rows: range) -> tuple[Tensor, Tensor]:
+    """Return the exact sampling positions of rows of a target, and which are mapped, see `Exact`."""
     if is_unknown(target.intrinsics):
         return _positions(source, target, rotation, None, pixels_of_rows(target, rows))
-    if tolerance and like.is_cpu:
-        lattice = on_lattice(source, target, rotation, tolerance, rows, padding)
-        if lattice is not None:
-            return lattice.pixels[:2]
-    exact = partial(_positions, source, target, rotation, _move_back(source, target, rotation, like))
+    exact = partial(_positions, source, target, rotation, _move_back(source, target, rotation, _like(target)))
     # by strips, which reuse the memory of intermediate results
     count = max(math.prod(c.batch_shape) for c in (source, target))
     count = count if rotation is None else max(count, math.prod(rotation.shape[:-2]))
-    step = max(_STRIP // max(count * width, 1), 1)
+    step = max(_STRIP // max(count * target.size_for("Warp")[1], 1), 1)
     part, seen = exact(pixels_of_rows(target, rows[:step]))
     if len(rows) <= step:
         return part, seen
@@ -353,8 +338,9 @@ def on_lattice(
 
     If fourth differences show that cubics may miss, positions in the middle of a cell and of its sides decide. There
     a cell's pixels come one by one, from quintics if these do not miss, else from the cameras, as at the limit of what
-    is mapped. None if that is most of the image. An edge between four nodes alone is not seen. Positions outside of the
-    image that the padding does not need keep no tolerance; for "reflection" all do.
+    is mapped. None if that is most of the image, and if torch records or transforms the cameras, or has them on another
+    device. An edge between four nodes alone is not seen. Positions outside of the image that the padding does not need
+    keep no tolerance; for "reflection" all do.
 
     If a camera or the rotation learns, its nodes and exact cells are computed again, with a graph. For this `learns`
     leaves cells that quintics do for `CELL_QUINTIC`, and more than a fifth exact ones are too many. None if derivatives
@@ -362,9 +348,11 @@ def on_lattice(
     target that begins again after a whole turn.
     """
     tensors = [*source.tensors, *target.tensors, *(() if rotation is None else (rotation,))]
+    if not is_eager(*tensors):
+        return None
     if keeps_graph(*tensors):
         turns = seam_of(target) is not None and target.intrinsics.requires_grad
-        if not is_eager(*tensors) or turns or any(map(_learns_by_parts, (source, target))):
+        if turns or any(map(_learns_by_parts, (source, target))):
             return None
         with torch.no_grad():  # a quarter: errors of positions are larger in derivatives than in images
             found = on_lattice(source, target, rotation, tolerance / 4, rows, padding, learns=True)
@@ -374,8 +362,6 @@ def on_lattice(
     if min(n, m) < FEWEST:
         return None
     native = _move_back(source, target, rotation, like)
-    if native is None and not are_free(like):
-        return None
     # the library finds cubics for each cell; torch alone first looks one node further, whether quintics do everywhere
     more = 5 if native is not None or learns or native_available() else 7
     nodes, size = (n + more) * (m + more), source.size_for("Warp")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from functools import partial
 from typing import Any, ClassVar, Literal
 
@@ -68,25 +67,32 @@ def _part(held: str, name: str) -> Any:
     return property(part)
 
 
-class WarpPlan:
-    """The positions of a warp while its cameras stay, or once and for all, and calls that are ready for some images."""
+class Positions:
+    """The positions of a warp's pixels while its cameras stay, or once and for all, and calls that sample there."""
 
     def __init__(self, pinned: Sampling | Lattice | None = None, padding: str = "zeros"):
         """Keep positions by the padding that they serve; `pinned` ones stay if the cameras change."""
         self.is_pinned = pinned is not None
         self.calls: dict[tuple[object, ...], Call] = {}
-        self.positions: dict[str, Sampling | Lattice] = {} if pinned is None else {padding: pinned}
+        self._found: dict[str, Sampling | Lattice] = {} if pinned is None else {padding: pinned}
         self._exact = pinned if isinstance(pinned, Sampling) else None
 
-    def positions_for(self, padding: str, compute: Callable[[], Sampling | Lattice]) -> Sampling | Lattice:
+    def serving(self, padding: str, compute: Callable[[], Sampling | Lattice]) -> Sampling | Lattice:
         """Return `compute()` without a graph, or what is kept; pinned positions that are exact serve all paddings."""
-        found = self.positions.get(padding) if self._exact is None else self._exact
+        found = self._found.get(padding) if self._exact is None else self._exact
         if found is None:
             if in_transform():  # a transform's tensors die with it
                 return compute()
             with outside_inference(), torch.no_grad():
-                found = self.positions[padding] = compute()
+                found = self._found[padding] = compute()
         return found
+
+    def keep(self, call: Call, form: tuple[object, ...], where: Sampling | Lattice) -> None:
+        """Keep the call for images of a form if its positions are kept."""
+        if any(where is each for each in self._found.values()):
+            if len(self.calls) >= _MOST_CALLS:
+                self.calls.clear()
+            self.calls[form] = call
 
 
 class CameraPair(GeometryModule):
@@ -146,8 +152,8 @@ class CameraPair(GeometryModule):
     @property
     def is_pinned(self) -> bool:
         """Whether positions stay whatever becomes of the cameras."""
-        plan: WarpPlan | None = self._kept.result
-        return plan is not None and plan.is_pinned
+        known: Positions | None = self._kept.result
+        return known is not None and known.is_pinned
 
     @property
     def host(self) -> Self | None:
@@ -232,25 +238,29 @@ class CameraPair(GeometryModule):
         looks = all(t.is_cpu and not is_unknown(t) for t in self.tensors)
         return "strips" if looks and (images is None or not in_graph(images)) else "kept"
 
-    def is_called(self, images: Tensor) -> bool:
-        """Whether a compiled graph calls this warp as an operator for images, which knows cameras of one model."""
-        return self._is_operator and compiled.takes(images, self.tensors)
+    def is_called(self, *images: Tensor) -> bool:
+        """Whether a compiled graph calls this warp, or its positions, as an operator: on the CPU, if nothing learns."""
+        if not (is_for_here() and self.knows_operator):
+            return False
+        inputs = *images, *self.tensors
+        return all(t.is_cpu for t in inputs) and not keeps_graph(*inputs)
 
     @property
-    def _is_operator(self) -> bool:
-        return is_for_here() and self.is_an_operator and not (self.source.is_mixed or self.target.is_mixed)
+    def knows_operator(self) -> bool:
+        """Whether there is an operator for a warp of this kind, whose cameras are of one model each."""
+        return self.is_an_operator and not (self.source.is_mixed or self.target.is_mixed)
 
     def ready(self, images: object, mode: str | None, padding: str | None) -> Call | None:
         """Return the call that an earlier one has left for images of this form, if nothing has changed since."""
-        plan: WarpPlan | None = self._kept.result
-        if plan is None or not plan.calls or not isinstance(images, Tensor):
+        known: Positions | None = self._kept.result
+        if known is None or not known.calls or not isinstance(images, Tensor):
             return None
         mode, padding = self.mode if mode is None else mode, self.padding_mode if padding is None else padding
         tensors = self.tensors
         if not is_eager(images, *tensors) or images.requires_grad:
             return None
-        call = plan.calls.get(self._form_of(images, mode, padding))
-        if call is None or plan.is_pinned:
+        call = known.calls.get(self._form_of(images, mode, padding))
+        if call is None or known.is_pinned:
             return call
         learns = images.dtype.is_floating_point and keeps_graph(*tensors)
         return None if learns or self._kept.entry(tensors, self.form) is None else call
@@ -258,9 +268,9 @@ class CameraPair(GeometryModule):
     def _form_of(self, images: Tensor, mode: str, padding: str) -> tuple[object, ...]:
         return images.shape, images.stride(), images.dtype, mode, padding, self.fill
 
-    def warped(self, images: Tensor, sampler: Sampler) -> Tensor:
-        """Return the warped images (B, C, H', W') of checked images (B, C, H, W)."""
-        route, given = self.route(images), images
+    def warped(self, images: Tensor, sampler: Sampler, route: Route | None = None) -> Tensor:
+        """Return the warped images (B, C, H', W') of checked images (B, C, H, W), whose route may be known."""
+        route, given = route or self.route(images), images
         images = self.lengthened(images)
         if route == "operator":
             options = self.tolerance, self.antialias, self._reach(sampler.padding_mode), sampler
@@ -273,18 +283,15 @@ class CameraPair(GeometryModule):
                 with torch.no_grad():
                     render(images, where, *sampler, kept, result[:, :, rows])
             return result
-        plan: WarpPlan | None = self._kept.result
+        known: Positions | None = self._kept.result
         where = self.positions(route, sampler.padding_mode)
         call = prepared(images, where, sampler)
         if call is None:
             return by_torch(images, where, sampler)
         result = call(images)
         # most warps are used once, and keep no calls
-        is_kept = plan is not None and any(where is each for each in plan.positions.values())
-        if plan is not None and is_kept and images is given and sampler.fill == self.fill:
-            if len(plan.calls) >= _MOST_CALLS:
-                plan.calls.clear()
-            plan.calls[self._form_of(images, sampler.mode, sampler.padding_mode)] = call
+        if known is not None and images is given and sampler.fill == self.fill:
+            known.keep(call, self._form_of(images, sampler.mode, sampler.padding_mode), where)
         return result
 
     def lengthened(self, images: Tensor) -> Tensor:
@@ -293,7 +300,7 @@ class CameraPair(GeometryModule):
         return images if seam is None else laid_as(images, seam.around(images))
 
     def positions(self, route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
-        """Return the positions at which target pixels sample the source's image, by the route "graph" or "kept"."""
+        """Return the positions at which target pixels sample the source's image: kept ones unless they have a graph."""
         if route == "graph":
             if in_jit_trace():
                 raise RuntimeError(
@@ -306,23 +313,25 @@ class CameraPair(GeometryModule):
             return constant
         reach, tolerance = self._reach(padding), self.tolerance
         compute = partial(self.computed, reach, tolerance)
-        with set_aside() if in_jit_trace() else nullcontext():  # a constant of the trace
-            return self._plan().positions_for(reach if tolerance else "zeros", compute)
+        if not in_jit_trace():
+            return self._positions().serving(reach if tolerance else "zeros", compute)
+        with set_aside():  # constants of the trace
+            return self._positions().serving(reach if tolerance else "zeros", compute).pixels
 
-    def _plan(self) -> WarpPlan:
-        plan: WarpPlan = self._kept.result
-        return plan if plan is not None and plan.is_pinned else self._kept(self.tensors, self.form, WarpPlan)
+    def _positions(self) -> Positions:
+        known: Positions = self._kept.result
+        return known if known is not None and known.is_pinned else self._kept(self.tensors, self.form, Positions)
 
     def by_pixel(self) -> Sampling:
         """Return the positions of all pixels, one by one."""
-        return self.positions("graph" if self.route() == "graph" else "kept").pixels
+        return self.positions(self.route()).pixels
 
     def computed(self, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
         """Return the positions of all pixels, without a graph, which serve a padding."""
         if tolerance:
             if not self.antialias and (host := self.host) is not None:
                 return host.positions("kept", padding).on(self.target.intrinsics.device)
-            if self._is_operator and self.target.intrinsics.is_cpu:
+            if self.is_called():
                 planes, mapped = compiled.positions(self.sampled, self.target, self.rotation, tolerance, padding)
                 grid = planes.movedim(1, -1)
                 return Sampling(grid, mapped, local_scale(grid, mapped, self.sampled) if self.antialias else None)
@@ -369,5 +378,5 @@ class CameraPair(GeometryModule):
                 grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
                 return where._replace(grid=grid, mapped=mapped)
 
-            plan = self._plan()
-            return own() if plan.is_pinned else plan.positions_for(f"constant {self._reach(padding)}", own)
+            known = self._positions()
+            return own() if known.is_pinned else known.serving(f"constant {self._reach(padding)}", own)

@@ -28,7 +28,7 @@ from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import typed_as
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
-from camtorch.warp.plan import CameraPair, WarpPlan
+from camtorch.warp.plan import CameraPair, Positions
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, Options, PaddingMode, Sampler, as_fill, as_options
 
 
@@ -231,14 +231,13 @@ class Warp(CameraPair):
     def pin(self) -> Warp:
         """Compute the grid once, with its graph, for a warp whose cameras will not change; return the warp."""
         # the operator of a compiled graph keeps its own; what inference mode makes could not be used in a graph later
-        is_operator = self.is_called(self.target.intrinsics.detach())
-        if self.is_pinned or is_operator or torch.is_inference_mode_enabled():
+        if self.is_pinned or self.is_called() or torch.is_inference_mode_enabled():
             return self
         if self.route() == "graph":
             where = self.locate(range(self.target.size_for("Warp")[0]), self.padding_mode, 0.0)
         else:
             where = self.positions("kept") if is_exporting() else self.computed(self.padding_mode, self.tolerance)
-        self._kept.renew(lambda: WarpPlan(where, self.padding_mode))
+        self._kept.renew(lambda: Positions(where, self.padding_mode))
         return self
 
     def transform_points(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
