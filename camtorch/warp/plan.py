@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from functools import partial
 from typing import Any, ClassVar, Literal
 
@@ -301,22 +302,21 @@ class CameraPair(GeometryModule):
 
     def positions(self, route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
         """Return the positions at which target pixels sample the source's image: kept ones unless they have a graph."""
+        is_traced, reach, tolerance = in_jit_trace(), self._reach(padding), self.tolerance
         if route == "graph":
-            if in_jit_trace():
+            if is_traced:
                 raise RuntimeError(
                     "Warp: cameras must not learn in torch.jit.trace and torch.onnx.export(dynamo=False); got some "
                     "that do. Use torch.onnx.export(dynamo=True) or torch.export; or make the map a constant by "
                     "warp.requires_grad_(False)"
                 )
-            return self.locate(range(self.target.size_for("Warp")[0]), self._reach(padding), self.tolerance)
+            return self.locate(range(self.target.size_for("Warp")[0]), reach, tolerance)
         if records_constants() and (constant := self._constant(padding)):
             return constant
-        reach, tolerance = self._reach(padding), self.tolerance
-        compute = partial(self.computed, reach, tolerance)
-        if not in_jit_trace():
-            return self._positions().serving(reach if tolerance else "zeros", compute)
-        with set_aside():  # constants of the trace
-            return self._positions().serving(reach if tolerance else "zeros", compute).pixels
+        with set_aside() if is_traced else nullcontext():
+            compute = partial(self.computed, reach, tolerance)
+            where = self._positions().serving(reach if tolerance else "zeros", compute)
+            return where.pixels if is_traced else where  # constants of the trace
 
     def _positions(self) -> Positions:
         known: Positions = self._kept.result

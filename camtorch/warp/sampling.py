@@ -136,12 +136,12 @@ def _by_torch(images: Tensor, where: Sampling, how: Sampler, kept: dict[int, Pyr
         picked = pixels.gather(2, index.expand(*images.shape[:2], -1)).view(images.dtype)
         return torch.where(seen.unsqueeze(1), picked.unflatten(2, where.grid.shape[1:3]), value)
     where = where._replace(grid=converted(where.grid, wide_dtype(dtype)))
-    plain = are_plain(images, where.grid)
+    plain = is_eager(images, where.grid) and are_plain(images, where.grid)
     large = plain and not wide and math.prod(images.shape[1:]) > _LARGE
     # the same for all strips of an image, however many cores are free: the pyramids that they keep are of these parts
     step = count if wide or not plain else 1 if large else thread_count()
     if not large and count <= step:
-        if wide or not plain or not is_eager(images, where.grid):
+        if wide or not plain:
             levels = _levels(kept, 0, widen(images))
             return narrow(_render(levels.images, where.grid, where, levels, how), dtype)
         # strip by strip, whose memory is used again: new memory takes as long as sampling
@@ -269,11 +269,16 @@ def sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) 
     if not (isinstance(images.shape[0], int) and len(grid) == len(images)):  # comparing would fix open sizes
         grid = grid.expand(images.shape[0], -1, -1, -1)
     if torch.compiler.is_compiling():  # torch.compile knows no jvp of our own, and needs none
-        return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
+        return _grid_sample(images, grid, mode, padding_mode)
     if are_plain(images, grid):
         return _sample(images, grid, mode, padding_mode)
     result: Tensor = _Sample.apply(images, grid, mode, padding_mode)  # type: ignore[no-untyped-call]
     return result
+
+
+def _grid_sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
+    """Return torch's samples of images (B, C, H, W) at a grid (B, H', W', 2)."""
+    return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
 
 
 def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
@@ -284,7 +289,7 @@ def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode)
         return call(images)
     threads = torch.get_num_threads()
     if len(images) >= threads:
-        result = F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
+        result = _grid_sample(images, grid, mode, padding_mode)
     else:
         result = images.new_empty(*images.shape[:2], *grid.shape[1:3])
         height = grid.shape[1] // threads  # of a tile; then come the rows that are left over
@@ -292,10 +297,10 @@ def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode)
         for made, image, places in zip(result, images, grid, strict=True):
             if tiles:
                 parts, same = places[:tiles].unflatten(0, (threads, height)), image.expand(threads, *image.shape)
-                sampled = F.grid_sample(same, parts, mode, padding_mode, align_corners=False)
+                sampled = _grid_sample(same, parts, mode, padding_mode)
                 made[:, :tiles].unflatten(1, (threads, height)).copy_(sampled.movedim(0, 1))
             if tiles < len(places):
-                rest = F.grid_sample(image[None], places[None, tiles:], mode, padding_mode, align_corners=False)
+                rest = _grid_sample(image[None], places[None, tiles:], mode, padding_mode)
                 made[:, tiles:] = rest[0]
     if mode == "bicubic" and not math.isfinite(result.sum()):
         # where the bicubic result is not finite, pixels without a weight, but for rounding, lose their part in it
@@ -414,7 +419,7 @@ class _Sample(torch.autograd.Function):
     def forward(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
         if images.is_cpu and are_known(images, grid):
             return _sample(images.detach(), grid.detach(), mode, padding_mode)  # native code takes no graph
-        return F.grid_sample(images, grid, mode, padding_mode, align_corners=False)
+        return _grid_sample(images, grid, mode, padding_mode)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -432,7 +437,7 @@ class _Sample(torch.autograd.Function):
     def jvp(ctx: Any, images_tangent: Tensor, grid_tangent: Tensor, *_: Any) -> Tensor:
         images, grid = ctx.saved_tensors
         count, channels = images.shape[:2]
-        tangent = F.grid_sample(images_tangent, grid, ctx.mode, ctx.padding_mode, align_corners=False)
+        tangent = _grid_sample(images_tangent, grid, ctx.mode, ctx.padding_mode)
         # a channel alone, so that its gradient by the positions is not added to that of others
         alone, at = images.flatten(0, 1).unsqueeze(1), grid.repeat_interleave(channels, 0)
         ones = torch.ones_like(tangent).flatten(0, 1).unsqueeze(1)

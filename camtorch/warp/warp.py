@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.door import is_exporting
 from camtorch.native.structs import OUTSIDE
 from camtorch.poses.rotations import as_rotation, turn
 from camtorch.values.arguments import (
@@ -236,7 +235,7 @@ class Warp(CameraPair):
         if self.route() == "graph":
             where = self.locate(range(self.target.size_for("Warp")[0]), self.padding_mode, 0.0)
         else:
-            where = self.positions("kept") if is_exporting() else self.computed(self.padding_mode, self.tolerance)
+            where = self.positions("kept")
         self._kept.renew(lambda: Positions(where, self.padding_mode))
         return self
 
