@@ -1,6 +1,9 @@
 """Two cameras at one place, and the way that images and points go from one to the other.
 
-The route of images is found once for a form of call, and kept while the cameras stay.
+Which way a warp goes is decided in four places. `CameraPair.route` chooses between kept positions, those of a graph,
+strips, and an operator of a compiled graph. `CameraPair.computed` has kept ones found by the same warp on the CPU, by
+an operator, or by `locate` in `grid.py`, which chooses between a lattice and exact positions. `prepared` in
+`sampling.py` chooses between native code and torch.
 """
 
 from __future__ import annotations
