@@ -66,7 +66,7 @@ def move(annotations: list[Any], image: torch.Tensor, camera: ct.Camera, augment
 
 def main(images: str, labels: str, camera: str, out: str, preset: str = "dms60", seed: int = 0) -> None:
     """Write the new images, and `labels.json` beside them, into the folder `out`."""
-    lens, content = ct.load(camera).camera, json.loads(Path(labels).read_text())
+    lens, content = ct.load(camera).camera, json.loads(Path(labels).read_bytes())
     random = ct.augment.RandomCamera(preset, yaw=5, pitch=5, roll=10, fov="source", min_filled=0.9)
     augment, annotations = ct.data.Seeded(random, seed=seed), list[Any]()
     for entry in tqdm(content["images"]):

@@ -424,7 +424,7 @@ def main(
     if not paths:
         raise FileNotFoundError(f"stress_test: images must be a folder of photographs; got {images!r}")
     lens = ct.load(camera).camera if Path(camera).is_file() else ct.lenses.find(camera)
-    things = photographs(paths, fov, json.loads(Path(boxes).read_text()) if boxes else None)
+    things = photographs(paths, fov, json.loads(Path(boxes).read_bytes()) if boxes else None)
     results = study(loaded(predict), things, lens.double().requires_grad_(False))
     print("\n".join([*table(results), *sentences(results)]))
     if out:

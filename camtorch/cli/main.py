@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     The status is 0; 1 if some of many files failed; 2 after an error, which is one line on stderr; 130 after an
     interrupt; 141 if the reader of the output closed it.
     """
-    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors in ("strict", "surrogateescape"):
         sys.stdout.reconfigure(errors="backslashreplace")  # for names of files that its encoding lacks
     if sys.stderr is None:  # closed by the shell; a bar asks whether it is a terminal
         sys.stderr = open(os.devnull, "w")  # noqa: SIM115

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+import sys
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from itertools import takewhile
 from pathlib import Path
@@ -90,16 +91,22 @@ def _is_below(path: str, folder: str) -> bool:
     return path == folder or path.startswith(os.path.join(folder, ""))
 
 
+def _key(path: Path) -> str:
+    """Return the same text for all names of a file; Windows and macOS do not distinguish a.png from A.png."""
+    name = os.path.realpath(path)
+    return name.casefold() if sys.platform in ("win32", "darwin") else name
+
+
 def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, force: bool) -> list[Pair]:
     """Return the pairs whose files must be made; with `resume` existing files are left out.
 
     An empty file, as after a loss of power, is made again. It raises a ValueError if files would overwrite each other
     or a file that is read, also one of `others`; or if a file exists already.
     """
-    read = {os.path.realpath(path): path for path in (*(source for source, _ in pairs), *others)}
+    read = {_key(path): path for path in (*(source for source, _ in pairs), *others)}
     written: dict[str, Path] = {}
     for source, target in pairs:
-        if (place := os.path.realpath(target)) in written:
+        if (place := _key(target)) in written:
             raise ValueError(f"{written[place]} and {source} would both be written to {target}")
         if place in read:
             raise ValueError(f"{target}: would overwrite {read[place]}, which is read. Name another folder")

@@ -22,7 +22,8 @@ def reason(error: Exception) -> str:
     if lacks_memory(error):
         text = f"out of memory: {error}"
     elif isinstance(error, OSError) and error.strerror:
-        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        name = error.filename2 or error.filename  # the file that another one could not replace
+        text = f"{name}: {error.strerror}" if name else error.strerror
     elif isinstance(error, (ValueError, OSError, ImportError)) and str(error):
         text = str(error)
     else:

@@ -11,7 +11,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -224,7 +224,7 @@ def _vcd_sample(samples: Samples, entry: tuple[Json, str, str, str | None, int, 
     with _failing_at(place, "not as OpenLABEL has it: ", *_UNLIKE):
         content = root["frames"][frame]
         if uri:
-            away = Path(uri).is_absolute() or ".." in Path(uri).parts
+            away = Path(uri).anchor or ".." in Path(uri).parts
             path = _find(samples, place, Path(uri).name, ("" if away else str(Path(uri).parent),))
             image = _image_at(path) if path.suffix.lower() in _SUFFIXES else _video_frame(path, at)
             sample |= {} if image is None else {"image": image}
@@ -277,8 +277,8 @@ def _find(
     samples: Samples, place: object, name: Any, folders: Sequence[str] = (), suffixes: Sequence[str] = ("",)
 ) -> Path:
     """Return the path of an image in `samples.images`, or next to its labels, also in `folders` there and higher up."""
-    parts = PurePosixPath(name if isinstance(name, str) and "\0" not in name else "")
-    if parts.is_absolute() or ".." in parts.parts or not parts.name:
+    parts = PurePath(name if isinstance(name, str) and "\0" not in name else "")
+    if parts.anchor or ".." in parts.parts or not parts.name:
         raise ValueError(f"{place}: file name must lie within the folder of images; got {name!r:.60}")
     labels = Path(place) if isinstance(place, Path) else samples.path
     roots = [labels.parent, *labels.resolve().parent.parents][: _UP + 1 if folders else 1]

@@ -5,6 +5,7 @@ COLMAP puts pixel centres at 0.5. Its poses are camera from world, as in camtorc
 
 from __future__ import annotations
 
+import codecs
 import os
 import re
 import struct
@@ -196,6 +197,8 @@ _ImageEntry = tuple[int, Iterable[float], str, str, bool]  # place, pose, id of 
 
 def _images_from_text(path: str, file: BinaryIO) -> Iterator[_ImageEntry]:
     number = 0
+    if file.read(len(codecs.BOM_UTF8)) != codecs.BOM_UTF8:  # some editors write this mark
+        file.seek(0)
     while line := file.readline(_LONGEST_LINE):
         number += 1
         record = Record(path, None, f"line {number}")

@@ -1,5 +1,6 @@
 """What is refused is so in one line that names it, before anything is written."""
 
+import contextlib
 import io
 import shutil
 import sys
@@ -13,6 +14,7 @@ from rigs import tables
 
 import camtorch as ct
 from camtorch.cli import terminal
+from camtorch.cli.main import main
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +77,35 @@ def test_work_of_more_than_a_moment_shows_how_far_it_is_and_leaves_nothing(monke
     for text in ("dewarping:  10%|", "10/100", " images/s"):
         assert (text in stderr.getvalue()) == stderr.isatty()
     assert not stderr.getvalue().split("\r")[-1].strip()
+
+
+def test_the_file_that_cannot_be_replaced_is_named():
+    error = PermissionError(13, "Access is denied", ".0f.part", 5, "camera.yml")  # as of Windows, if it is open
+    assert terminal.reason(error) == "camera.yml: Access is denied"
+
+
+@pytest.mark.parametrize("console", [("cp1252", "strict"), ("cp437", "strict"), ("ascii", "surrogateescape")])
+def test_a_console_without_utf8_shows_what_each_command_prints(tmp_path, monkeypatch, console):
+    monkeypatch.chdir(tmp_path)
+    write_photograph(tmp_path)
+    Path("小 kamera.yml").write_bytes(Path("camera.yml").read_bytes())
+    for words in (
+        "show 小*kamera.yml --html 小.html",
+        "convert 小*kamera.yml -o 小.json",
+        "dewarp in.png --camera 小*kamera.yml -o 小.png",
+        "map 小*kamera.yml -o 小.npz",
+        "lenses 小蚁 -n 1 -o 小蚁.json",
+        "dewarp --help",
+        "--version",
+    ):
+        printed = io.BytesIO()
+        stream = io.TextIOWrapper(printed, console[0], console[1])
+        monkeypatch.setattr(sys, "stdout", stream)
+        with contextlib.suppress(SystemExit):
+            assert main([word.replace("*", " ") for word in words.split()]) == 0, words
+        stream.flush()
+        assert printed.getvalue(), words
+        assert (b"\\u5c0f" in printed.getvalue()) == ("小" in words), printed.getvalue()
 
 
 def test_messages_are_one_line_and_do_not_steer_the_terminal(capsys):

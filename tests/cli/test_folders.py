@@ -1,5 +1,6 @@
 """`camtorch dewarp` on folders."""
 
+import contextlib
 import os
 import random
 import signal
@@ -16,7 +17,7 @@ from command_line import MATRIX, command, opened, refused
 from PIL import Image
 
 from camtorch.boards.finding import IMAGES
-from camtorch.cli import targets
+from camtorch.cli import processes, targets
 
 TRIALS = int(os.environ.get("CAMTORCH_TRIALS", "1"))
 WORDS = ["dewarp", "in", "--camera", "camera.yml", "-o", "out/"]
@@ -217,12 +218,23 @@ def group_has_ended(number):
 
 
 @pytest.mark.slow
-def test_processes_make_the_same(folder, capsys):
+@pytest.mark.parametrize("how", ["forkserver", "spawn"])
+def test_processes_make_the_same(folder, capsys, monkeypatch, how):
+    monkeypatch.setattr(processes, "_HOW", how)
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)  # which Windows and macOS lack
     Path("in/words.jpg").write_text("no image")
-    for place, jobs in (("one", 1), ("two", 2)):
-        command(*WORDS[:-1], place, "--jobs", jobs, expect=1)
+    for place, jobs in (("one", ["--jobs", 1]), ("another földer", [])):
+        command(*WORDS[:-1], place, *jobs, expect=1)
         assert capsys.readouterr().err.startswith("camtorch: error: in/words.jpg: cannot identify image file")
-    assert outputs("one") == outputs("two")
+    assert outputs("one") == outputs("another földer")
+
+
+@pytest.mark.parametrize(("system", "same"), [("linux", False), ("win32", True), ("darwin", True)])
+def test_names_that_differ_in_case_are_one_file_on_windows_and_macos(tmp_path, monkeypatch, system, same):
+    monkeypatch.setattr(sys, "platform", system)
+    pairs = [(tmp_path / name, tmp_path / "out" / f"{name[0]}.png") for name in ("a.jpg", "A.bmp")]
+    with pytest.raises(ValueError, match="would both be written to") if same else contextlib.nullcontext():
+        assert targets.to_make(pairs, [], resume=False, force=False) == pairs
 
 
 @pytest.mark.slow

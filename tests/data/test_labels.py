@@ -4,6 +4,7 @@ import json
 import pickle
 import re
 import shutil
+from pathlib import PureWindowsPath
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from torch.utils.data import DataLoader
 
 import camtorch as ct
 from camtorch.augment.landmarks import LANDMARKS
+from camtorch.data import labels
 
 SIZE = (24, 32)
 IMAGE = np.random.default_rng(0).integers(0, 255, (*SIZE, 3), np.uint8)
@@ -135,6 +137,21 @@ def test_samples_are_what_the_file_says(dataset):
         with pytest.raises(IndexError):
             samples[beyond]
     assert name in repr(samples)
+
+
+def test_an_editor_of_windows_does_not_change_samples(dataset):
+    name, path, expected = dataset
+    for file in path.rglob("*.pts") if path.is_dir() else [path]:
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
+    test_samples_are_what_the_file_says((name, path, expected))
+
+
+@pytest.mark.parametrize("name", [r"..\a.png", r"C:\a.png", "C:a.png", r"\a.png", "/a.png", "../a.png"])
+def test_no_name_leads_out_of_a_folder_of_windows(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(labels, "PurePath", PureWindowsPath)
+    path = text(tmp_path / "list.txt", f"{row(points(98))} {name}")
+    with pytest.raises(ValueError, match="file name must lie within the folder of images"):
+        ct.data.read(path)[0]
 
 
 def test_augmentations_take_samples_and_mirror_them_twice_into_themselves(dataset):

@@ -66,6 +66,19 @@ def test_what_editors_do_to_a_file_is_no_fault_of_it(name, start, end, tmp_path)
     assert_same(ct.load(path), ct.load(FILES / name))
 
 
+def test_an_editor_of_windows_does_not_change_poses_of_colmap(tmp_path):
+    folder = tmp_path / "a folder of späce"
+    folder.mkdir()
+    poses = ["a.png", "b.png"], ct.Extrinsics([[0.1] * 3] * 2, [[0.0, 1.0, 2.0]] * 2).double()
+    camera = ct.load(FILES / "opencv_camera.yml").camera
+    ct.save(ct.Rig({"1": camera}, poses, images=dict.fromkeys(poses[0], "1")), folder / "cameras.txt")
+    before = ct.load(folder)
+    assert len(before.images) == 2
+    for name in ("cameras.txt", "images.txt"):
+        (folder / name).write_bytes(b"\xef\xbb\xbf" + (folder / name).read_bytes().replace(b"\n", b"\r\n"))
+    assert_same(ct.load(folder), before)
+
+
 @pytest.mark.parametrize(
     ("call", "given", "error", "says"),
     [
