@@ -14,6 +14,7 @@ import re
 import sys
 import sysconfig
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -56,7 +57,8 @@ class NativeSampler(BuildHookInterface):
         except (building.BuildError, OSError) as error:
             why = _line(str(error))
             self.app.display_warning(f"camtorch is installed without its native sampler: {why}")
-            library.unlink(missing_ok=True)
+            with suppress(PermissionError):  # on Windows, where a process has it loaded
+                library.unlink(missing_ok=True)
             reason.write_text(why + "\n", "utf-8")
         if version == "editable":  # a path and nothing else
             return

@@ -81,8 +81,8 @@ def build(directory: str | os.PathLike[str] | None = None, *, sources: str | os.
         The path of the library.
 
     Raises:
-        BuildError: If there is no compiler, or if it fails.
-        OSError: If `directory` cannot be written; on Windows also while a process has the library loaded.
+        BuildError: If there is no compiler, or if it fails; on Windows also while a process has the library loaded.
+        OSError: If `directory` cannot be written.
     """
     command = _compiler()
     here = _HERE if sources is None else Path(sources).absolute()
@@ -134,7 +134,11 @@ def build(directory: str | os.PathLike[str] | None = None, *, sources: str | os.
             list(pool.map(compiled, missing))
         libraries = [] if _SUFFIX == "dll" else ["-lm"]
         _run([*command, "-shared", "-o", LIBRARY, *map(str, places.values()), *libraries], folder)
-        os.replace(Path(folder, LIBRARY), target)
+        try:
+            os.replace(Path(folder, LIBRARY), target)
+        except PermissionError as error:  # of Windows; elsewhere processes keep the old file
+            way = "End the processes that use camtorch, and build again"
+            raise BuildError(f"{target} must not be in use; got an error: {error.strerror}. {way}") from error
     return target
 
 
@@ -175,17 +179,19 @@ def _run(command: list[str], folder: str) -> str:
 
 def _compiler() -> list[str]:
     """Return the words of the compiler's command, which may have options as in CC="ccache gcc"."""
-    named = os.environ.get("CC", "").strip()
+    named, windows = os.environ.get("CC", "").strip(), sys.platform == "win32"
     if named:
-        words = [named] if shutil.which(named) else shlex.split(named)
+        # shlex takes the backslashes of a path away
+        words = [named] if shutil.which(named) else shlex.split(named.replace("\\", "/") if windows else named)
         if shutil.which(words[0]) is None:
             raise BuildError(f"CC must name a C compiler; got {words[0]!r}, which is not on the PATH")
         return words
-    names = ("gcc", "clang") if sys.platform == "win32" else ("cc", "gcc", "clang")
+    names = ("gcc", "clang") if windows else ("cc", "gcc", "clang")
     for name in names:
         if shutil.which(name):
             return [name]
-    raise BuildError(f"no C compiler: one of {', '.join(names)} must be on the PATH; got none. Install one, or set CC")
+    got = "none, and Visual Studio's cl does not take their options" if windows else "none"
+    raise BuildError(f"no C compiler: one of {', '.join(names)} must be on the PATH; got {got}. Install one, or set CC")
 
 
 if __name__ == "__main__":

@@ -117,4 +117,4 @@ def structs_py(folder: Path = _HERE) -> str:
 
 
 if __name__ == "__main__":
-    (_HERE / "structs.py").write_text(structs_py(), "utf-8")
+    (_HERE / "structs.py").write_text(structs_py(), "utf-8", newline="\n")

@@ -132,6 +132,27 @@ def test_without_a_compiler_the_error_says_what_was_sought(tmp_path, no_compiler
     monkeypatch.setenv("CC", "my-own-cc -m64")
     with pytest.raises(BuildError, match="'my-own-cc'"):
         build(tmp_path, sources=tmp_path)
+    monkeypatch.setattr(building.sys, "platform", "win32")
+    monkeypatch.setenv("CC", r"C:\tools\my-own-cc.exe -m64")
+    with pytest.raises(BuildError, match=r"'C:/tools/my-own-cc\.exe'"):
+        building._compiler()
+    monkeypatch.delenv("CC")
+    with pytest.raises(BuildError, match=r"one of gcc, clang .*; got none, and Visual Studio's cl does not take"):
+        building._compiler()
+
+
+@compiles
+def test_a_library_that_windows_does_not_replace_says_what_to_do(tmp_path, monkeypatch):
+    write(tmp_path)
+
+    def replace(source, target):
+        if str(target).endswith(LIBRARY):
+            raise PermissionError(13, "Access is denied", source, 5, target)
+        os.rename(source, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    with pytest.raises(BuildError, match=r"must not be in use; got .* denied. End the processes that use camtorch"):
+        build(tmp_path, sources=tmp_path)
 
 
 def copy(folder):

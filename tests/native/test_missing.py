@@ -1,6 +1,7 @@
 """A missing library speaks: once a process, at the first call that is much slower without it."""
 
 import functools
+import os
 import warnings
 
 import pytest
@@ -61,6 +62,7 @@ def warp(_):
     return len(caught)
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
 def test_the_first_worker_of_a_loader_speaks_for_all(missing):
     loader = torch.utils.data.DataLoader(range(4), num_workers=2, collate_fn=warp, multiprocessing_context="fork")
     assert [*loader] == [1, 0, 0, 0]
