@@ -13,6 +13,7 @@ from torch import Tensor
 
 from camtorch.optics.derivatives import jacobian_of
 from camtorch.optics.model_spec import Optics
+from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import broadcast_shapes, columns
 from camtorch.values.module import remade
@@ -171,12 +172,12 @@ def field_of_view(camera: CameraLike) -> Tensor:
     lines = (left, cy, right, cy), (cx, top, cx, bottom), (left, top, right, bottom), (left, bottom, right, top)
     ends = torch.stack([torch.stack(torch.broadcast_tensors(*line, cx)[:4], -1) for line in lines], -2)
     start, along = ends[..., None, :2], ends[..., None, 2:] - ends[..., None, :2]
-    least = start.new_full(start.shape[:-2], torch.inf, dtype=torch.float64)
+    least = precise(start).new_full(start.shape[:-2], torch.inf)
     most = -least
     share = torch.linspace(0, 1, _LINE).to(start).expand(*least.shape, _LINE)
     for _ in range(4):  # the whole line, then closer around the ends of its visible part
         rays, valid = camera.unproject(start + share[..., None] * along)
-        x, y, z = rays.double().unbind(-1)
+        x, y, z = precise(rays).unbind(-1)
         # signed angles from the axis, whose sum may exceed half a circle, unlike an angle between two rays
         forward = x * along[..., 0] + y * along[..., 1]
         angles = torch.atan2(torch.hypot(x, y).copysign(forward), z)

@@ -17,6 +17,7 @@ from camtorch.evaluate.door import in_transform, keeps_graph
 from camtorch.evaluate.tensors import are_known, are_plain, is_unknown
 from camtorch.native.sampler import maker
 from camtorch.native.structs import STEP
+from camtorch.optics.radial_inverse import WITHOUT_FLOAT64
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
@@ -172,7 +173,9 @@ class AffineWarp(MirrorWarp):
         super().__init__(source, target, rotation, **options)
         self.map = matrix
         own = as_tensor(matrix)
-        self.register_buffer("matrix", own.to(source.intrinsics.device), persistent=False)
+        device = source.intrinsics.device
+        dtype = torch.float32 if device.type in WITHOUT_FLOAT64 else own.dtype
+        self.register_buffer("matrix", own.to(device, dtype), persistent=False)
         self.batch_shape: torch.Size = broadcast_shapes(self.batch_shape, own.shape[:-2])
         # the way depends on numbers on the CPU alone: it is the same on every device, and waits for none
         self._numbers: list[Rows] = own.reshape(-1, 2, 3).tolist() if own is matrix and are_known(own) else []

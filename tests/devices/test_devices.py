@@ -2,6 +2,9 @@
 
 import copy
 import operator
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -32,6 +35,11 @@ def test_results_are_those_of_the_cpu_and_costs_do_not_grow():
     failed, table = try_cases("table")
     print(table)
     assert not failed, table
+
+
+@pytest.mark.slow
+def test_cameras_warps_and_augmentations_do_without_float64():
+    subprocess.run([sys.executable, Path(__file__).with_name("without_float64.py")], check=True)
 
 
 K = FISHEYE.distortion.detach()
