@@ -86,9 +86,10 @@ def _line(text: str) -> str:
 
 
 def _platform() -> str:
-    """As wheels name it. A library for Linux fits where the C library is no older, which auditwheel looks into."""
-    if sys.platform != "darwin":
-        return sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    """As wheels name it. A library for Linux fits where the C library is no older, which .ci/wheels.py looks into."""
+    other = os.environ.get("_PYTHON_HOST_PLATFORM", "")  # which build.py reads too
+    if other or sys.platform != "darwin":
+        return re.sub("[-.]", "_", other or sysconfig.get_platform())
     # a universal Python compiles for the machine that it runs on; from macOS 11 on names have no minor version
     target = os.environ.get("MACOSX_DEPLOYMENT_TARGET") or str(sysconfig.get_config_var("MACOSX_DEPLOYMENT_TARGET"))
     major, minor = (int(part) for part in f"{target}.0".split(".")[:2])

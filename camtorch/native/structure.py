@@ -49,10 +49,17 @@ class Calls(CDLL):
             call.restype, call.argtypes = result, takes
 
 
+def offsets(structs: Iterable[type[Struct]]) -> Iterator[int]:
+    """Yield the size of each structure, then the offset and the size of each of its fields."""
+    for struct in structs:
+        yield sizeof(struct)
+        for name, *_ in struct._fields_:
+            field = getattr(struct, name)
+            yield from (field.offset, field.size)
+
+
 def layout(checksum: int, structs: Iterable[type[Struct]]) -> int:
     """Return what `camtorch_layout` of a library with such names, types and values returns if fields lie like here."""
-    for struct in structs:
-        fields = (getattr(struct, name) for name, *_ in struct._fields_)
-        for number in (sizeof(struct), *(number for field in fields for number in (field.offset, field.size))):
-            checksum = (checksum ^ number) * 16777619 & 0xFFFFFFFF
+    for number in offsets(structs):
+        checksum = (checksum ^ number) * 16777619 & 0xFFFFFFFF
     return checksum
