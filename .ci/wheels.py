@@ -201,14 +201,13 @@ def main(words: list[str], folder: Path) -> None:
     if not targets:
         sys.exit(f"TARGET must be a word of {', '.join(('any', *TARGETS))}; got {' '.join(words)}")
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as work:
-        run(sys.executable, "-m", "build", "--sdist", "--outdir", work)
-        (archive,) = Path(work).glob("*.tar.gz")
-        for target in targets:
-            wheel = build(archive, target, folder)
-            elsewhere = target != "any" and "linux" not in target
-            may = "release.yml publishes it if it loads there" if elsewhere else "may be published"
-            print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.2f} MB; {check(wheel)}; {may}", flush=True)
+    run(sys.executable, "-m", "build", "--sdist", "--outdir", folder)
+    archive = max(folder.glob("*.tar.gz"), key=os.path.getmtime)
+    for target in targets:
+        wheel = build(archive, target, folder)
+        elsewhere = target != "any" and "linux" not in target
+        may = "release.yml publishes it if it loads there" if elsewhere else "may be published"
+        print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.2f} MB; {check(wheel)}; {may}", flush=True)
 
 
 if __name__ == "__main__":
