@@ -29,7 +29,7 @@ def read_rig(
     `name` chooses one camera; `model` and `size` complete a file without them. `stated`: refuse an ambiguous model.
     """
     if str(path).startswith(LENS):
-        words = path.as_posix().removeprefix(LENS)  # names have slashes, as in 50/1.8
+        words = str(path).removeprefix(LENS)
         known = (size and lenses.search(words, image_size=size)) or find(words)
         others = f", the best of {len(known)} that camtorch lenses lists" if len(known) > 1 else ""
         note(f"{words}: {known[0]!r}{others}")
