@@ -24,7 +24,7 @@ TABLE_WIDTH = 2 + 2 * NODES  # columns of `tabulate`
 _LIMITING = 16  # roots of a radius, to one whose image is a number
 _HALF_WAY = 2.0  # the squared radius in the middle of the table of a lens that never folds
 MOST_STEPS = 5  # of Newton's method; slower methods finish what still moves
-WITHOUT_FLOAT64 = {"mps"}  # types of devices
+WITHOUT_FLOAT64 = ("mps",)  # types of devices
 
 
 def precise(k: Tensor) -> Tensor:

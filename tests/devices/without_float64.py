@@ -10,7 +10,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import pretended
 
 import camtorch as ct
-from camtorch.optics.radial_inverse import WITHOUT_FLOAT64
+from camtorch.optics import radial_inverse
+from camtorch.warp import affine
 
 make = pretended.Pretended.__new__
 
@@ -22,7 +23,7 @@ def refuse(cls, on_host):
 
 
 pretended.Pretended.__new__ = staticmethod(refuse)
-WITHOUT_FLOAT64.add(pretended.NAME)
+radial_inverse.WITHOUT_FLOAT64 = affine.WITHOUT_FLOAT64 = (pretended.NAME,)
 library = pretended.install()
 device = torch.device(pretended.NAME, 0)
 points = (torch.rand(2, 5, 3) + torch.tensor([-0.5, -0.5, 1.0])).to(device)
