@@ -18,6 +18,8 @@
 #include "sampler_floats.h"
 #if defined(__AVX2__)
 #include "sampler_bytes.h"
+#elif NEON
+#include "sampler_neon.h"
 #endif
 #if WIDE
 #include "sampler_wide.h"
@@ -35,8 +37,8 @@ INLINE void chunk(Span *span, char *first, const Chunk *at, int64_t n, int type,
         pad(at->v, on_image.v, n, job->source_height, job->padding, type);
         at = &on_image;
     }
-    while (i < n && shows_nothing(job, load8(at->u + i), load8(at->v + i), mode)) i += STEP;
-    while (end > i && shows_nothing(job, load8(at->u + end - STEP), load8(at->v + end - STEP), mode)) end -= STEP;
+    while (i < n && shows_nothing(job, load_floats(at->u + i), load_floats(at->v + i), mode)) i += LANES;
+    while (end > i && shows_nothing(job, load_floats(at->u + end - LANES), load_floats(at->v + end - LANES), mode)) end -= LANES;
     span->result = first, span->pixels = i < n ? i : n;
     if (i) show_nothing(span, type);
     if (i >= n) return;
@@ -47,7 +49,7 @@ INLINE void chunk(Span *span, char *first, const Chunk *at, int64_t n, int type,
     i = wide(span, first, at, i, n, type, mode, layout);
     if (i >= n) return;
 #endif
-#if defined(__AVX2__)
+#if defined(__AVX2__) || NEON
     const int64_t *from = job->source_strides, *to = job->result_strides;
     const Image image = {span->source, job->channels, from[1], from[2], to[1], job->source_width, job->source_height};
     const int in_planes = layout == PLANES || (mode == NEAREST && from[3] == 1 && to[3] == 1);
@@ -58,7 +60,7 @@ INLINE void chunk(Span *span, char *first, const Chunk *at, int64_t n, int type,
         return;
     }
 #endif
-    eights(span, first, at, i, n, type, mode, layout);
+    groups(span, first, at, i, n, type, mode, layout);
 }
 
 /* -- tiles */
@@ -112,8 +114,8 @@ static int layout_of(const Job *job) {
 
 #define NAME(type, mode, layout) JOINED(JOINED(JOINED(rows, type), mode), layout)
 #define MADE(type, mode, layout)                                                                                       \
-    static NOT_INLINE void NAME(type, mode, layout)(const Job *job, const Chunk *at, int64_t b, int64_t y, int64_t count,     \
-                                             int64_t x, int64_t n) {                                                   \
+    static NOT_INLINE void NAME(type, mode, layout)(const Job *job, const Chunk *at, int64_t b, int64_t y,             \
+                                                    int64_t count, int64_t x, int64_t n) {                             \
         rows(job, at, b, y, count, x, n, type, mode, layout);                                                          \
     }
 #define COMPUTED(type, mode, taps, reach, weights)                                                                     \

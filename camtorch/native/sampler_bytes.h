@@ -2,12 +2,6 @@
  * level.
  */
 
-/* Where images lie, of the kinds that are known here, strides in elements */
-typedef struct {
-    const char *source;
-    int64_t channels, from_plane, below, to_plane, width, height;
-} Image;
-
 /* Keeps a constant in a register: compilers make it again for each use */
 INLINE __m256i kept(__m256i constant) {
     __asm__("" : "+x"(constant));
@@ -60,23 +54,23 @@ enum { FIVE_ROWS = 5 };
 
 /* The lesser of the first positions of eight pixels and of the next eight, less what others may lie lower; from 0 to
  * `last`, also if it is NaN */
-INLINE I8 begins(const float *x, int64_t last) {
+INLINE Wholes begins(const float *x, int64_t last) {
 #define TWO(i) _mm_unpacklo_ps(_mm_loadu_ps(x + STEP * (i)), _mm_loadu_ps(x + STEP * ((i) + 1)))
     const __m256 first = _mm256_set_m128(_mm_movelh_ps(TWO(4), TWO(6)), _mm_movelh_ps(TWO(0), TWO(2)));
 #undef TWO
     const __m256 turned = _mm256_permutevar8x32_ps(first, _mm256_setr_epi32(1, 2, 3, 4, 5, 6, 7, 0));
     const __m256 next = _mm256_blend_ps(turned, _mm256_broadcast_ss(x + STEP * STEP), 0x80);
     const __m256 least = _mm256_sub_ps(_mm256_min_ps(next, first), _mm256_set1_ps(1 / 64.0f));
-    return whole8((V8)_mm256_max_ps(_mm256_min_ps(least, _mm256_set1_ps((float)last)), _mm256_setzero_ps()));
+    return truncated((Floats)_mm256_max_ps(_mm256_min_ps(least, _mm256_set1_ps((float)last)), _mm256_setzero_ps()));
 }
 
 static NOT_INLINE void windows_of(const Image *image, const Chunk *at, int64_t i, int64_t n, Windows *windows) {
     int64_t j;
     for (j = i / STEP / STEP * STEP; j < n / STEP; j += STEP) {
-        const I8 x = begins(at->u + STEP * j, image->width - 16);
-        const I8 y = begins(at->v + STEP * j, image->height - FIVE_ROWS);
-        const I8 begin = y * (int32_t)image->below + x;
-        const V8 from_u = 128 - float8(x), from_v = 128 - float8(y);
+        const Wholes x = begins(at->u + STEP * j, image->width - 16);
+        const Wholes y = begins(at->v + STEP * j, image->height - FIVE_ROWS);
+        const Wholes begin = y * (int32_t)image->below + x;
+        const Floats from_u = 128 - as_floats(x), from_v = 128 - as_floats(y);
         memcpy(windows->u + j, &from_u, sizeof from_u), memcpy(windows->v + j, &from_v, sizeof from_v);
         memcpy(windows->at + j, &begin, sizeof begin);
     }
@@ -352,12 +346,6 @@ static NOT_INLINE void anywhere(const Job *job, const Image *image, char *result
     else any_eight(job, image, result, u, v, 4);
 }
 
-/* Whether 16 bits hold all places of an image, and its rows at least eight bytes */
-INLINE int is_small(const Image *image) {
-    const int has_small_steps = image->below >= 0 && image->below < 32768;
-    return has_small_steps && image->width >= 8 && image->width < 32767 && image->height < 32767;
-}
-
 /* Whether what lies off an image, and is blended in, is a byte */
 INLINE int fills_bytes(const Job *job, const Image *image) {
     int fits = 1;
@@ -373,8 +361,8 @@ INLINE void off_windows(Span *span, const Image *image, char *first, const Chunk
     const int fits = mode == BILINEAR && is_small(image) && fills_bytes(span->job, image);
     for (; i < n && fits; i += pixel == 1 ? 16 : STEP)
         anywhere(span->job, image, first + i * pixel, at->u + i, at->v + i, pixel);
-    if (mode == NEAREST) eights(span, first, at, i, n, BYTES1, NEAREST, SCATTERED);
-    else eights(span, first, at, i, n, UINT8, BILINEAR, pixel == 1 ? PLANES : INTERLEAVED);
+    if (mode == NEAREST) groups(span, first, at, i, n, BYTES1, NEAREST, SCATTERED);
+    else groups(span, first, at, i, n, UINT8, BILINEAR, pixel == 1 ? PLANES : INTERLEAVED);
 }
 
 /* Makes pixels i ... n - 1, at least sixteen from 0 on: some before i again, if registers would not be full */

@@ -1,4 +1,4 @@
-/* Eight pixels at a time in floats, of every type, on every kind of CPU; what is off the image goes one by one. */
+/* LANES pixels at a time in floats, of every type, on every kind of CPU; what is off the image goes one by one. */
 
 enum { MOST_INTERLEAVED = 4 }; /* channels */
 enum { ROWS_AHEAD = 8 };       /* of the source */
@@ -11,74 +11,82 @@ INLINE void ask_below(const void *from, int64_t below) {
     __builtin_prefetch((const char *)((uintptr_t)from + (uintptr_t)(ROWS_AHEAD * below)));
 }
 
-/* Where eight pixels are read: from the corner (x, y) of a square of four pixels, at a part of its sides */
+/* Where pixels are read: from the corner (x, y) of a square of four pixels, at a part of its sides */
 typedef struct {
-    I8 x, y;
-    V8 u, v; /* parts of the right column and of the lower row */
+    Wholes x, y;
+    Floats u, v; /* parts of the right column and of the lower row */
 } Squares;
 
 /* Whether all lie on the image, with `right` and `below` more pixels to the right and below */
-INLINE int inside(const Job *job, V8 u, V8 v, float before, float beyond) {
-    const V8 low = every8(before);
-    const V8 right = every8((float)(job->source_width - 1) - beyond);
-    const V8 below = every8((float)(job->source_height - 1) - beyond);
-    return all8((u >= low) & (u <= right) & (v >= low) & (v <= below));
+INLINE int inside(const Job *job, Floats u, Floats v, float before, float beyond) {
+    const Floats low = every(before);
+    const Floats right = every((float)(job->source_width - 1) - beyond);
+    const Floats below = every((float)(job->source_height - 1) - beyond);
+    return all_true((u >= low) & (u <= right) & (v >= low) & (v <= below));
 }
 
 /* Whether no square begins in the last `beyond` columns or in the last row */
-INLINE Squares squares_of(const Job *job, V8 u, V8 v, int32_t beyond) {
+INLINE Squares squares_of(const Job *job, Floats u, Floats v, int32_t beyond) {
     Squares at;
-    at.x = least8(whole8(u), every8i((int32_t)job->source_width - 1 - beyond));
-    at.y = least8(whole8(v), every8i((int32_t)job->source_height - 2));
-    at.u = u - float8(at.x);
-    at.v = v - float8(at.y);
+    at.x = lesser_of(truncated(u), every_whole((int32_t)job->source_width - 1 - beyond));
+    at.y = lesser_of(truncated(v), every_whole((int32_t)job->source_height - 2));
+    at.u = u - as_floats(at.x);
+    at.v = v - as_floats(at.y);
     return at;
 }
 
-/* -- eight pixels of one channel whose neighbours in a row are neighbours in memory */
+/* -- pixels of one channel whose neighbours in a row are neighbours in memory */
 
-INLINE void store_floats(char *to, V8 value, int64_t n) {
-    if (n == STEP) memcpy(to, &value, sizeof value);
+INLINE void store_floats(char *to, Floats value, int64_t n) {
+    if (n == LANES) memcpy(to, &value, sizeof value);
     else memcpy(to, &value, (size_t)n * sizeof(float));
 }
 
-INLINE void store_bytes(char *to, I8 value, int64_t n) {
-    typedef int16_t W8 __attribute__((vector_size(16)));
-    typedef uint8_t B8 __attribute__((vector_size(8)));
+INLINE void store_bytes(char *to, Wholes value, int64_t n) {
+    typedef int16_t W8 __attribute__((vector_size(2 * LANES)));
+    typedef uint8_t B8 __attribute__((vector_size(LANES)));
     const B8 bytes = __builtin_convertvector(__builtin_convertvector(value, W8), B8); /* in steps compilers know */
-    if (n == STEP) memcpy(to, &bytes, sizeof bytes);
+    if (n == LANES) memcpy(to, &bytes, sizeof bytes);
     else memcpy(to, &bytes, (size_t)n);
 }
 
-INLINE void store_words(char *to, I8 value, int64_t n) {
-    typedef uint16_t W8 __attribute__((vector_size(16)));
+INLINE void store_words(char *to, Wholes value, int64_t n) {
+    typedef uint16_t W8 __attribute__((vector_size(2 * LANES)));
     W8 words = __builtin_convertvector(value, W8);
     memcpy(to, &words, (size_t)n * 2);
 }
 
-/* Eight pixels of an image, of any rows */
-INLINE V8 gathered(const char *from, const int64_t *at, int type) {
-    V8 floats;
-    I8 whole;
+/* Pixels of an image, of any rows */
+INLINE Floats gathered(const char *from, const int64_t *at, int type) {
+    Floats floats;
+    Wholes whole;
     int i;
-    for (i = 0; i < STEP; i++) {
+    for (i = 0; i < LANES; i++) {
         if (type == FLOAT32) floats[i] = ((const float *)from)[at[i]];
         else if (type == UINT16) whole[i] = ((const uint16_t *)from)[at[i]];
         else whole[i] = ((const uint8_t *)from)[at[i]];
     }
-    return type == FLOAT32 ? floats : float8(whole);
+    return type == FLOAT32 ? floats : as_floats(whole);
 }
 
-/* Eight pairs of neighbours in a row, between which `part` lies */
-INLINE V8 between_pairs(const char *from, const int64_t *at, V8 part, int type) {
-    V8 left, right;
+/* Pairs of neighbours in a row, between which `part` lies */
+INLINE Floats between_pairs(const char *from, const int64_t *at, Floats part, int type) {
+    Floats left, right;
 #if defined(__AVX2__)
     if (type == FLOAT32) {
 #define PAIR(i) from + 4 * at[i]
         const __m256 even = _mm256_castsi256_ps(quarters(PAIR(0), PAIR(1), PAIR(4), PAIR(5)));
         const __m256 odd = _mm256_castsi256_ps(quarters(PAIR(2), PAIR(3), PAIR(6), PAIR(7)));
 #undef PAIR
-        left = (V8)_mm256_shuffle_ps(even, odd, 0x88), right = (V8)_mm256_shuffle_ps(even, odd, 0xdd);
+        left = (Floats)_mm256_shuffle_ps(even, odd, 0x88), right = (Floats)_mm256_shuffle_ps(even, odd, 0xdd);
+        return left * (1 - part) + right * part;
+    }
+#elif NEON
+    if (type == FLOAT32) {
+#define PAIR(i) vld1_f32((const float *)from + at[i])
+        const float32x4_t even = vcombine_f32(PAIR(0), PAIR(1)), odd = vcombine_f32(PAIR(2), PAIR(3));
+#undef PAIR
+        left = vuzp1q_f32(even, odd), right = vuzp2q_f32(even, odd);
         return left * (1 - part) + right * part;
     }
 #endif
@@ -86,15 +94,15 @@ INLINE V8 between_pairs(const char *from, const int64_t *at, V8 part, int type) 
     return left * (1 - part) + right * part;
 }
 
-/* Where eight pixels lie in memory, from the first one of the image on, in elements */
-INLINE void offsets_of(const Job *job, I8 x, I8 y, int64_t *offsets) {
+/* Where pixels lie in memory, from the first one of the image on, in elements */
+INLINE void offsets_of(const Job *job, Wholes x, Wholes y, int64_t *offsets) {
     const int64_t down = job->source_strides[2], across = job->source_strides[3];
     int i;
     if (down * job->source_height + across * job->source_width < INT32_MAX) {
-        const I8 at = y * (int32_t)down + x * (int32_t)across;
-        for (i = 0; i < STEP; i++) offsets[i] = at[i];
+        const Wholes at = y * (int32_t)down + x * (int32_t)across;
+        for (i = 0; i < LANES; i++) offsets[i] = at[i];
     } else {
-        for (i = 0; i < STEP; i++) offsets[i] = y[i] * down + x[i] * across;
+        for (i = 0; i < LANES; i++) offsets[i] = y[i] * down + x[i] * across;
     }
 }
 
@@ -104,20 +112,20 @@ INLINE void bilinear_planes(const Span *span, Squares at, int type) {
     const int64_t from = job->source_strides[1] * bytes, to = job->result_strides[1] * bytes;
     const char *plane = span->source;
     char *result = span->result;
-    int64_t offsets[STEP], c;
+    int64_t offsets[LANES], c;
     offsets_of(job, at.x, at.y, offsets);
     for (c = 0; c < job->channels; c++, plane += from, result += to) {
-        const V8 above = between_pairs(plane, offsets, at.u, type);
-        const V8 under = between_pairs(plane + below * bytes, offsets, at.u, type);
-        const V8 value = above * (1 - at.v) + under * at.v;
+        const Floats above = between_pairs(plane, offsets, at.u, type);
+        const Floats under = between_pairs(plane + below * bytes, offsets, at.u, type);
+        const Floats value = above * (1 - at.v) + under * at.v;
         ask_below(plane + offsets[0] * bytes, below * bytes);
         if (type == FLOAT32) store_floats(result, value, span->pixels);
-        else if (type == UINT16) store_words(result, rounded8(value), span->pixels);
-        else store_bytes(result, type == BOOL ? truth8(value) : rounded8(value), span->pixels);
+        else if (type == UINT16) store_words(result, rounded_all(value), span->pixels);
+        else store_bytes(result, type == BOOL ? truth(value) : rounded_all(value), span->pixels);
     }
 }
 
-/* -- eight pixels whose three or four channels are neighbours in memory, and then come those of the next pixel */
+/* -- pixels whose three or four channels are neighbours in memory, and then come those of the next pixel */
 
 INLINE V4 channels4(const char *at, int type) {
     if (type == FLOAT32) return load4((const float *)at);
@@ -143,12 +151,12 @@ INLINE void bilinear_interleaved(const Span *span, Squares at, int type) {
     const Job *job = span->job;
     const int64_t bytes = size_of(type), channels = job->channels;
     const int64_t right = channels * bytes, below = job->source_strides[2] * bytes;
-    float values[STEP * MOST_INTERLEAVED + 4];
-    int64_t offsets[STEP], i, n = span->pixels * channels;
+    float values[LANES * MOST_INTERLEAVED + 4];
+    int64_t offsets[LANES], i, n = span->pixels * channels;
     offsets_of(job, at.x, at.y, offsets);
     ask_below(span->source + offsets[0] * bytes, below);
-    ask_below(span->source + offsets[STEP - 1] * bytes, below);
-    for (i = 0; i < STEP; i++) {
+    ask_below(span->source + offsets[LANES - 1] * bytes, below);
+    for (i = 0; i < LANES; i++) {
         const char *upper = span->source + offsets[i] * bytes, *lower = upper + below;
         const V4 u = every4(at.u[i]), v = every4(at.v[i]);
         const V4 above = channels4(upper, type) * (1 - u) + channels4(upper + right, type) * u;
@@ -157,52 +165,52 @@ INLINE void bilinear_interleaved(const Span *span, Squares at, int type) {
         memcpy(values + i * channels, &value, sizeof value);
     }
     if (type == FLOAT32) {
-        if (span->pixels == STEP && channels == 3) memcpy(span->result, values, 24 * sizeof(float));
+        if (span->pixels == LANES && channels == 3) memcpy(span->result, values, 3 * LANES * sizeof(float));
         else memcpy(span->result, values, (size_t)n * sizeof(float));
     } else {
-        for (i = 0; i < n; i += STEP) {
-            const I8 whole = type == BOOL ? truth8(load8(values + i)) : rounded8(load8(values + i));
-            const int64_t left = n - i < STEP ? n - i : STEP;
+        for (i = 0; i < n; i += LANES) {
+            const Wholes whole = type == BOOL ? truth(load_floats(values + i)) : rounded_all(load_floats(values + i));
+            const int64_t left = n - i < LANES ? n - i : LANES;
             if (type == UINT16) store_words(span->result + 2 * i, whole, left);
             else store_bytes(span->result + i, whole, left);
         }
     }
 }
 
-/* -- eight pixels of one channel, sixteen neighbours each */
+/* -- pixels of one channel, sixteen neighbours each */
 
-INLINE void cubic_weights8(V8 t, V8 *w) {
-    const V8 s = 1 - t;
+INLINE void cubic_weights_all(Floats t, Floats *w) {
+    const Floats s = 1 - t;
     w[0] = -0.75f * t * s * s;
     w[1] = (1.25f * t - 2.25f) * t * t + 1;
     w[2] = (1.25f * s - 2.25f) * s * s + 1;
     w[3] = -0.75f * s * t * t;
 }
 
-/* Columns of a table of eight rows */
-INLINE void transpose(const V4 *rows, V8 *columns) {
+/* Columns of a table */
+INLINE void transpose(const V4 *rows, Floats *columns) {
     int i, k;
     for (k = 0; k < 4; k++)
-        for (i = 0; i < STEP; i++) columns[k][i] = rows[i][k];
+        for (i = 0; i < LANES; i++) columns[k][i] = rows[i][k];
 }
 
-INLINE void bicubic_planes(const Span *span, V8 u, V8 v, int type) {
+INLINE void bicubic_planes(const Span *span, Floats u, Floats v, int type) {
     const Job *job = span->job;
     const int64_t bytes = size_of(type), below = job->source_strides[2] * bytes;
     const Squares at = squares_of(job, u, v, 1);
-    V8 across[4], down[4];
-    int64_t offsets[STEP], c;
+    Floats across[4], down[4];
+    int64_t offsets[LANES], c;
     int i;
     offsets_of(job, at.x, at.y, offsets);
-    cubic_weights8(at.u, across);
-    cubic_weights8(at.v, down);
+    cubic_weights_all(at.u, across);
+    cubic_weights_all(at.v, down);
     for (c = 0; c < job->channels; c++) {
         const char *plane = span->source + c * job->source_strides[1] * bytes;
         char *result = span->result + c * job->result_strides[1] * bytes;
-        V4 rows[STEP];
-        V8 columns[4], value;
+        V4 rows[LANES];
+        Floats columns[4], value;
         ask_below(plane + offsets[0] * bytes, below);
-        for (i = 0; i < STEP; i++) {
+        for (i = 0; i < LANES; i++) {
             const char *row = plane + (offsets[i] - 1) * bytes - below;
             rows[i] = channels4(row, type) * every4(down[0][i]) + channels4(row + below, type) * every4(down[1][i]) +
                       channels4(row + 2 * below, type) * every4(down[2][i]) +
@@ -211,54 +219,54 @@ INLINE void bicubic_planes(const Span *span, V8 u, V8 v, int type) {
         transpose(rows, columns);
         value = columns[0] * across[0] + columns[1] * across[1] + columns[2] * across[2] + columns[3] * across[3];
         if (type == FLOAT32) {
-            if (!all8((value >= every8(-3.4028235e38f)) & (value <= every8(3.4028235e38f))))
-                for (i = 0; i < STEP; i++) {
+            if (!all_true((value >= every(-3.4028235e38f)) & (value <= every(3.4028235e38f))))
+                for (i = 0; i < LANES; i++) {
                     const Taps taps = taps_at(job, u[i], v[i], BICUBIC);
                     value[i] = sample_at(job, plane, &taps, 0, FLOAT32, BICUBIC);
                 }
             store_floats(result, value, span->pixels);
         } else if (type == BOOL) {
-            store_bytes(result, truth8(value), span->pixels);
+            store_bytes(result, truth(value), span->pixels);
         } else {
-            value = clamped8(value, type == UINT16 ? 65535 : 255);
-            if (type == UINT16) store_words(result, rounded8(value), span->pixels);
-            else store_bytes(result, rounded8(value), span->pixels);
+            value = clamped_all(value, type == UINT16 ? 65535 : 255);
+            if (type == UINT16) store_words(result, rounded_all(value), span->pixels);
+            else store_bytes(result, rounded_all(value), span->pixels);
         }
     }
 }
 
-INLINE void nearest8(const Span *span, V8 u, V8 v, int type) {
+INLINE void nearest_all(const Span *span, Floats u, Floats v, int type) {
     const Job *job = span->job;
-    const I8 x = rounded8(u), y = rounded8(v);
-    int64_t offsets[STEP], c, i;
+    const Wholes x = rounded_all(u), y = rounded_all(v);
+    int64_t offsets[LANES], c, i;
     offsets_of(job, x, y, offsets);
     for (c = 0; c < job->channels; c++) {
         const char *plane = span->source + c * job->source_strides[1] * size_of(type);
         char *result = span->result + c * job->result_strides[1] * size_of(type);
         ask_below(plane + offsets[0] * size_of(type), job->source_strides[2] * size_of(type));
-        if (span->pixels == STEP && job->result_strides[3] == 1)
-            for (i = 0; i < STEP; i++) move(result, i, plane, offsets[i], type);
+        if (span->pixels == LANES && job->result_strides[3] == 1)
+            for (i = 0; i < LANES; i++) move(result, i, plane, offsets[i], type);
         else
             for (i = 0; i < span->pixels; i++) move(result, i * job->result_strides[3], plane, offsets[i], type);
     }
 }
 
-/* Whether eight pixels lie beyond what zeros reach, or have no position */
-INLINE int shows_nothing(const Job *job, V8 u, V8 v, int mode) {
+/* Whether pixels lie beyond what zeros reach, or have no position */
+INLINE int shows_nothing(const Job *job, Floats u, Floats v, int mode) {
     const float reach = job->padding != ZEROS ? INFINITY : reach_of(mode);
-    const V8 low = every8(-reach);
-    const V8 right = every8((float)(job->source_width - 1) + reach);
-    const V8 below = every8((float)(job->source_height - 1) + reach);
-    return all8(~((u >= low) & (u <= right) & (v >= low) & (v <= below)));
+    const Floats low = every(-reach);
+    const Floats right = every((float)(job->source_width - 1) + reach);
+    const Floats below = every((float)(job->source_height - 1) + reach);
+    return all_true(~((u >= low) & (u <= right) & (v >= low) & (v <= below)));
 }
 
-INLINE void eight(const Span *span, const float *at_u, const float *at_v, int type, int mode, int layout) {
+INLINE void group(const Span *span, const float *at_u, const float *at_v, int type, int mode, int layout) {
     const Job *job = span->job;
-    const V8 u = load8(at_u), v = load8(at_v);
+    const Floats u = load_floats(at_u), v = load_floats(at_v);
     int done = 0;
     if (mode == NEAREST) {
         if (inside(job, u, v, 0, 0)) {
-            nearest8(span, u, v, type);
+            nearest_all(span, u, v, type);
             return;
         }
     } else if (mode == BILINEAR && layout == PLANES) {
@@ -285,10 +293,10 @@ INLINE void eight(const Span *span, const float *at_u, const float *at_v, int ty
     const int several = job->source_width > 2 && job->source_height > 1;
     if (job->padding == ZEROS && mode == BILINEAR && layout != SCATTERED && several) {
         /* those on the image at once, with the corner in the place of the others */
-        const I8 in = (u >= every8(0)) & (u <= every8((float)(job->source_width - 2))) & (v >= every8(0)) &
-                      (v <= every8((float)(job->source_height - 1)));
-        if ((done = lanes8(in))) {
-            const V8 on_u = (V8)((I8)u & in), on_v = (V8)((I8)v & in);
+        const Wholes in = (u >= every(0)) & (u <= every((float)(job->source_width - 2))) & (v >= every(0)) &
+                      (v <= every((float)(job->source_height - 1)));
+        if ((done = true_lanes(in))) {
+            const Floats on_u = (Floats)((Wholes)u & in), on_v = (Floats)((Wholes)v & in);
             if (layout == PLANES) bilinear_planes(span, squares_of(job, on_u, on_v, 1), type);
             else bilinear_interleaved(span, squares_of(job, on_u, on_v, 2), type);
         }
@@ -298,18 +306,30 @@ INLINE void eight(const Span *span, const float *at_u, const float *at_v, int ty
 
 #else
 
-INLINE void eight(const Span *span, const float *at_u, const float *at_v, int type, int mode, int layout) {
+INLINE void group(const Span *span, const float *at_u, const float *at_v, int type, int mode, int layout) {
     (void)layout;
     careful(span, at_u, at_v, type, mode, 0);
 }
 
 #endif
 
+/* Where images lie, of the kinds that ways of some types know, strides in elements */
+typedef struct {
+    const char *source;
+    int64_t channels, from_plane, below, to_plane, width, height;
+} Image;
+
+/* Whether 16 bits hold all places of an image, and its rows at least eight bytes */
+INLINE int is_small(const Image *image) {
+    const int has_small_steps = image->below >= 0 && image->below < 32768;
+    return has_small_steps && image->width >= 8 && image->width < 32767 && image->height < 32767;
+}
+
 /* Pixels i ... n - 1 of a row; `first`: where that at 0 is written */
-INLINE void eights(Span *span, char *first, const Chunk *at, int64_t i, int64_t n, int type, int mode, int layout) {
+INLINE void groups(Span *span, char *first, const Chunk *at, int64_t i, int64_t n, int type, int mode, int layout) {
     const int64_t step = span->job->result_strides[3] * size_of(type);
-    for (; i < n; i += STEP) {
-        span->result = first + i * step, span->pixels = n - i < STEP ? n - i : STEP;
-        eight(span, at->u + i, at->v + i, type, mode, layout);
+    for (; i < n; i += LANES) {
+        span->result = first + i * step, span->pixels = n - i < LANES ? n - i : LANES;
+        group(span, at->u + i, at->v + i, type, mode, layout);
     }
 }

@@ -2,7 +2,7 @@
  * without vectors of everything, with which tests compare the others.
  */
 
-/* What eight pixels are written to and read from */
+/* What a group of pixels is written to and read from */
 typedef struct {
     const Job *job;
     const char *source; /* of the image */

@@ -32,9 +32,12 @@ static NOT_INLINE void lay_line(const float *nodes, int64_t cells, float side, f
     for (j = 0; j < cells; j++, nodes++, line += STEP) {
         const float a = nodes[0] * half, b = nodes[1] * half, c = nodes[2] * half, d = nodes[3] * half;
 #if VECTORS
-        const V8 made = load8(WEIGHTS[0]) * a + load8(WEIGHTS[1]) * b + load8(WEIGHTS[2]) * c + load8(WEIGHTS[3]) * d +
-                        middle;
-        memcpy(line, &made, sizeof made);
+        for (int k = 0; k < STEP; k += LANES) {
+#define ALL(row) load_floats(WEIGHTS[row] + k)
+            const Floats made = ALL(0) * a + ALL(1) * b + ALL(2) * c + ALL(3) * d + middle;
+#undef ALL
+            memcpy(line + k, &made, sizeof made);
+        }
 #else
         int k;
         for (k = 0; k < STEP; k++)
@@ -119,17 +122,17 @@ static void grid_positions(const Job *job, int64_t b, int64_t y, int64_t x, int6
 static NOT_INLINE void pad(const float *x, float *to, int64_t n, int64_t side, int padding, int type) {
     /* the last pixel belongs to the square before it, as bytes are interpolated */
     const float end = (float)(side - 1), last = type == UINT8 ? end - greater(end, 128) * 1.2e-7f : end;
-    const V8 far = every8(2097152.0f);
+    const Floats far = every(2097152.0f);
     int64_t i;
     int k;
-    for (i = 0; i < n; i += STEP) {
-        V8 at = load8(x + i);
-        if (padding == REFLECTION && !all8((at >= every8(0)) & (at <= every8(end)))) {
-            if (all8((at > -far) & (at < far))) at = reflected8(at, (float)side);
+    for (i = 0; i < n; i += LANES) {
+        Floats at = load_floats(x + i);
+        if (padding == REFLECTION && !all_true((at >= every(0)) & (at <= every(end)))) {
+            if (all_true((at > -far) & (at < far))) at = reflected_all(at, (float)side);
             else
-                for (k = 0; k < STEP; k++) at[k] = at[k] == at[k] ? reflected(at[k], (float)side) : at[k];
+                for (k = 0; k < LANES; k++) at[k] = at[k] == at[k] ? reflected(at[k], (float)side) : at[k];
         }
-        at = clamped8(at, greater(last, 0));
+        at = clamped_all(at, greater(last, 0));
         memcpy(to + i, &at, sizeof at);
     }
     to[i] = to[i - 1];

@@ -319,13 +319,13 @@ INLINE int64_t wide(Span *span, char *first, const Chunk *at, int64_t i, int64_t
     if (mode == BILINEAR && type == FLOAT32 && in_planes && image.width >= 32 && image.height >= 5) {
         for (; n - i >= 16; i += 16)
             if (!sixteen(&image, first + 4 * i, at->u + i, at->v + i))
-                eights(span, first, at, i, i + 16, FLOAT32, BILINEAR, PLANES);
+                groups(span, first, at, i, i + 16, FLOAT32, BILINEAR, PLANES);
         return i;
     }
     if (mode == NEAREST && type == BYTES4 && in_planes && llabs(image.below) * image.height + image.width < INT32_MAX) {
         for (; n - i >= 16; i += 16)
             if (!nearest_of_sixteen(&image, first + 4 * i, at->u + i, at->v + i))
-                eights(span, first, at, i, i + 16, BYTES4, NEAREST, SCATTERED);
+                groups(span, first, at, i, i + 16, BYTES4, NEAREST, SCATTERED);
         return i;
     }
     if (!(mode == BILINEAR ? type == UINT8 : mode == NEAREST && type == BYTES1) || n - i < 32) return i;

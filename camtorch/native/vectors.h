@@ -1,8 +1,13 @@
-/* Eight numbers at a time, and four: their types, and what is done to all of them alike. Not what they mean. */
+/* LANES numbers at a time, and four: their types, and what is done to all of them alike. Not what they mean. */
 #if defined(__AVX2__)
 #include <immintrin.h>
+#elif defined(__aarch64__) && !defined(CAMTORCH_PLAIN)
+#include <arm_neon.h>
+#define NEON 1
 #endif
-
+#if !defined(NEON)
+#define NEON 0
+#endif
 #if defined(CAMTORCH_PLAIN)
 #define VECTORS 0
 #else
@@ -14,15 +19,21 @@
 #define WIDE 0
 #endif
 
+/* GCC makes two registers of a vector that is twice as long for x86; for ARM it takes such a vector apart */
+#if NEON
+enum { LANES = 4 };
+#else
+enum { LANES = 8 };
+#endif
+
 #if VECTORS
 
-typedef float V8 __attribute__((vector_size(32)));
-typedef int32_t I8 __attribute__((vector_size(32)));
+typedef float Floats __attribute__((vector_size(4 * LANES)));
+typedef int32_t Wholes __attribute__((vector_size(4 * LANES)));
 typedef float V4 __attribute__((vector_size(16)));
-typedef int32_t I4 __attribute__((vector_size(16)));
 
-INLINE V8 load8(const float *from) {
-    V8 value;
+INLINE Floats load_floats(const float *from) {
+    Floats value;
     memcpy(&value, from, sizeof value);
     return value;
 }
@@ -33,27 +44,30 @@ INLINE V4 load4(const float *from) {
     return value;
 }
 
-INLINE V8 every8(float value) { return (V8){value, value, value, value, value, value, value, value}; }
-INLINE I8 every8i(int32_t value) { return (I8){value, value, value, value, value, value, value, value}; }
-INLINE V4 every4(float value) { return (V4){value, value, value, value}; }
-INLINE I8 whole8(V8 value) { return __builtin_convertvector(value, I8); }
-INLINE V8 float8(I8 value) { return __builtin_convertvector(value, V8); }
-INLINE V4 float4(I4 value) { return __builtin_convertvector(value, V4); }
+INLINE Floats every(float value) { return value - (Floats){0}; }
+INLINE Wholes every_whole(int32_t value) { return value - (Wholes){0}; }
+INLINE V4 every4(float value) { return value - (V4){0}; }
+INLINE Wholes truncated(Floats value) { return __builtin_convertvector(value, Wholes); }
+INLINE Floats as_floats(Wholes value) { return __builtin_convertvector(value, Floats); }
 
 /* A bit for each that is true */
-INLINE int lanes8(I8 mask) {
+INLINE int true_lanes(Wholes mask) {
 #if defined(__AVX2__)
     return _mm256_movemask_ps((__m256)mask);
+#elif NEON
+    return vaddvq_s32(vandq_s32(mask, (int32x4_t){1, 2, 4, 8}));
 #else
     int lanes = 0, i;
-    for (i = 0; i < STEP; i++) lanes |= (mask[i] != 0) << i;
+    for (i = 0; i < LANES; i++) lanes |= (mask[i] != 0) << i;
     return lanes;
 #endif
 }
 
-INLINE int all8(I8 mask) {
+INLINE int all_true(Wholes mask) {
 #if defined(__AVX2__)
-    return lanes8(mask) == 0xff;
+    return true_lanes(mask) == 0xff;
+#elif NEON
+    return vminvq_u32((uint32x4_t)mask) != 0;
 #else
     int64_t parts[4];
     memcpy(parts, &mask, sizeof parts);
@@ -61,38 +75,38 @@ INLINE int all8(I8 mask) {
 #endif
 }
 
-INLINE I8 least8(I8 a, I8 b) {
-    const I8 less = a < b;
+INLINE Wholes lesser_of(Wholes a, Wholes b) {
+    const Wholes less = a < b;
     return (a & less) | (b & ~less);
 }
 
 /* What is not a number fails every comparison, and stays */
-INLINE V8 clamped8(V8 x, float last) {
+INLINE Floats clamped_all(Floats x, float last) {
 #if defined(__AVX2__)
-    return (V8)_mm256_max_ps(_mm256_setzero_ps(), _mm256_min_ps(_mm256_set1_ps(last), (__m256)x));
+    return (Floats)_mm256_max_ps(_mm256_setzero_ps(), _mm256_min_ps(_mm256_set1_ps(last), (__m256)x));
 #endif
-    const I8 low = x < every8(0), high = x > every8(last);
-    return (V8)(((I8)x & ~low & ~high) | ((I8)every8(last) & high));
+    const Wholes low = x < every(0), high = x > every(last);
+    return (Floats)(((Wholes)x & ~low & ~high) | ((Wholes)every(last) & high));
 }
 
 /* See `reflected`; of numbers whose size is below 2^21 */
-INLINE V8 reflected8(V8 x, float side) {
-    V8 distance = (V8)((I8)(x + 0.5f) & 0x7fffffff), sides = distance / side, extra;
-    const I8 whole = whole8(sides);
-    extra = distance - float8(whole) * side;
-    extra = (V8)(((I8)(side - extra) & -(whole & 1)) | ((I8)extra & ~-(whole & 1)));
-    return clamped8(extra - 0.5f, side - 1);
+INLINE Floats reflected_all(Floats x, float side) {
+    Floats distance = (Floats)((Wholes)(x + 0.5f) & 0x7fffffff), sides = distance / side, extra;
+    const Wholes whole = truncated(sides);
+    extra = distance - as_floats(whole) * side;
+    extra = (Floats)(((Wholes)(side - extra) & -(whole & 1)) | ((Wholes)extra & ~-(whole & 1)));
+    return clamped_all(extra - 0.5f, side - 1);
 }
 
 /* To the nearest whole number, of numbers whose size is below 2^22 */
-INLINE I8 rounded8(V8 value) {
-    const V8 large = every8(12582912.0f);
-    V8 sum = value + large;
-    return (I8)sum - (I8)large;
+INLINE Wholes rounded_all(Floats value) {
+    const Floats large = every(12582912.0f);
+    Floats sum = value + large;
+    return (Wholes)sum - (Wholes)large;
 }
 
 /* True from one half on, as bytes */
-INLINE I8 truth8(V8 value) { return -(value >= every8(0.5f)); }
+INLINE Wholes truth(Floats value) { return -(value >= every(0.5f)); }
 
 #if defined(__AVX2__)
 
