@@ -13,12 +13,14 @@ typedef struct {
     const char *name;
     void (*sample)(Job *);
     void (*classify)(const Classification *);
+    void (*lay)(Laying *);
 } Variant;
 
 #define DECLARED(variant)                                                                                              \
     void sample_##variant(Job *);                                                                                      \
-    void classify_##variant(const Classification *);
-#define LISTED(variant) {#variant, sample_##variant, classify_##variant}
+    void classify_##variant(const Classification *);                                                                   \
+    void lay_##variant(Laying *);
+#define LISTED(variant) {#variant, sample_##variant, classify_##variant, lay_##variant}
 DECLARED(plain)
 #ifdef HAS_BASELINE
 DECLARED(baseline)
@@ -423,6 +425,74 @@ static void classify_any(const Variant *all, int n) {
     free(nodes), free(mapped), free(rim);
 }
 
+static float *uniform_floats(int64_t count) {
+    float *made = allocated(count * 4);
+    for (int64_t i = 0; i < count; i++) made[i] = (float)uniform(-2, 2);
+    return made;
+}
+
+static double product(const float *a, const float *b, int64_t count) {
+    double sum = 0;
+    for (int64_t i = 0; i < count; i++) sum += a[i] == a[i] ? (double)a[i] * b[i] : 0;
+    return sum;
+}
+
+static int are_near(const float *a, const float *b, int64_t count, double by) {
+    int good = 1;
+    for (int64_t i = 0; i < count; i++) good &= fabs((double)a[i] - b[i]) <= by;
+    return good;
+}
+
+/* Lays a lattice, and gathers gradients: the number of the variant that differs from plain, or whose gradients are not the
+ * transpose of its positions; -1 if all are fine */
+static int lay_any(const Variant *all, int n) {
+    Laying given;
+    memset(&given, 0, sizeof given);
+    given.count = 1 + below(2), given.height = side(), given.width = side();
+    if (given.height * given.width > 5000 && !one_in(20)) given.height = 1 + below(20), given.width = 1 + below(700);
+    given.rows = (given.height + STEP - 1) / STEP, given.columns = (given.width + STEP - 1) / STEP;
+    const int64_t cells = given.count * given.rows * given.columns, pixels = given.count * given.height * given.width;
+    const int64_t nodes = 2 * given.count * (given.rows + 5) * (given.columns + 5);
+    const int usual = one_in(2) ? CELL_QUINTIC : CELL_CUBIC, rare = CELL_QUINTIC + CELL_CUBIC - usual;
+    const int64_t others = one_in(3) ? 0 : 1 + below(30);
+    int32_t *kinds = allocated(cells * 4);
+    for (int64_t i = 0; i < cells; i++) {
+        const int is_other = others && one_in(others);
+        kinds[i] = !is_other ? usual : one_in(3) ? rare : one_in(2) ? CELL_EMPTY : (int32_t)given.exact_count++;
+    }
+    const int64_t exact = 2 * given.exact_count * STEP * STEP;
+    float *from = uniform_floats(nodes), *from_exact = uniform_floats(exact), *weights = uniform_floats(2 * pixels);
+    for (int64_t i = 0; i < exact / 2; i++)
+        if (one_in(50)) from_exact[i] = from_exact[i + exact / 2] = NAN;
+    float *first[3] = {NULL, NULL, NULL};
+    int wrong = -1;
+    given.cells = kinds;
+    for (int k = 0; k < n && wrong < 0; k++) {
+        float *made[3] = {uniform_floats(2 * pixels), calloc((size_t)nodes, 4), calloc((size_t)exact + 1, 4)};
+        uint8_t *mapped = allocated(pixels);
+        given.nodes = from, given.exact = from_exact, given.grid = made[0], given.mapped = mapped;
+        given.is_transposed = 0, given.next = 0;
+        all[k].lay(&given);
+        given.nodes = made[1], given.exact = made[2], given.grid = weights, given.mapped = NULL;
+        given.is_transposed = 1, given.next = 0;
+        all[k].lay(&given);
+        double laid = 0;
+        for (int64_t i = 0; i < pixels; i++) laid += mapped[i] ? product(made[0] + 2 * i, weights + 2 * i, 2) : 0;
+        const double back = product(from, made[1], nodes) + product(from_exact, made[2], exact);
+        const int64_t counts[3] = {2 * pixels, nodes, exact};
+        if (!(fabs(laid - back) <= 1e-5 * (double)(pixels + 100))) wrong = k;
+        for (int j = 0; j < 3; j++) {
+            if (!k) first[j] = made[j];
+            else if (!are_near(made[j], first[j], counts[j], j ? 1e-4 : 1e-5)) wrong = k;
+            if (k) free(made[j]);
+        }
+        free(mapped);
+    }
+    for (int j = 0; j < 3; j++) free(first[j]);
+    free(kinds), free(from), free(from_exact), free(weights);
+    return wrong;
+}
+
 int main(int argc, char **argv) {
     Variant all[8];
     const int n = variants(all);
@@ -451,6 +521,10 @@ int main(int argc, char **argv) {
         free(expected);
         release(&drawing);
         classify_any(all, n);
+        if ((k = lay_any(all, n)) >= 0) {
+            fprintf(stderr, "job %lld: %s lays another lattice, or gathers other gradients\n", (long long)i, all[k].name);
+            return 1;
+        }
     }
     for (k = 1; k < n; k++) printf("%s %.2g\n", all[k].name, largest[k]);
     return 0;
