@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -30,6 +31,7 @@ from camtorch.warp.warp import Warp
 
 _FEW = 2 / 3  # of what an image shows of its own camera: with less than that, on average, it warns
 _TRIES = 8
+_first = operator.itemgetter(0)
 
 
 class FlipOptions(SampleOptions, total=False):
@@ -264,7 +266,7 @@ class Augmentation(SampleTransform):
     def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
         """Return drawn values, (*B,) or (*B, size); without *B if all are alike, so that one map serves all samples."""
         if isinstance(draw["apply"], list):  # of one sample
-            values = {name: value[0] for name, value in draw.items()}
+            values = dict(zip(draw, map(_first, draw.values()), strict=True))  # without a loop of Python
             del values["apply"]
             return values
         values = {name: value for name, value in draw.items() if name != "apply"}
@@ -369,8 +371,8 @@ class Augmentation(SampleTransform):
         batch = self._batch(sample, kinds=kinds)
         plan, camera, count = batch.plan, batch.camera, batch.plan.count
         if draw is None:
-            numbers = self._raw_draw(count, self.p, self.same_on_batch, generator)
-            change = self._change_where_drawn(camera, self._of_sample(numbers, batch.rows))
+            numbers = self._of_sample(self._raw_draw(count, self.p, self.same_on_batch, generator), batch.rows)
+            change = (self._change if plan.is_cpu else self._change_where_drawn)(camera, numbers)
         else:
             change = self.change(camera, self._of_sample(draw, batch.rows))
         if change.count != count:

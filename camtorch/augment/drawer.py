@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, ClassVar, Literal
@@ -59,6 +60,7 @@ _EXACT = "fov", "crop", "vignetting", "cos4"  # a single number is a range of on
 _AUTO = "focal", "centre", "distortion", "crop"
 _told: set[tuple[object, ...]] = set()
 _PLAIN = frozenset((Tensor, nn.Parameter))
+_is_cpu, _requires_grad = map(operator.attrgetter, ("is_cpu", "requires_grad"))
 
 
 class LensOptions(EditOptions, total=False):
@@ -210,12 +212,13 @@ class CameraDrawer(Augmentation):
         like = None if self.like is None else self._like_for(source)
         tensors = (source.intrinsics, source.distortion) if like is None else (*source.tensors, *like.tensors)
         # numbers come where nothing is recorded; without any, it is asked
-        first, learns = next(iter(values.values()), None), torch.is_grad_enabled()
+        first = next(iter(values.values()), None)
         if isinstance(first, Tensor) or (first is None and not are_numbers()):
             return None
-        for tensor in tensors:
-            if type(tensor) not in _PLAIN or not tensor.is_cpu or (learns and tensor.requires_grad):
-                return None
+        if not _PLAIN.issuperset(map(type, tensors)) or not all(map(_is_cpu, tensors)):
+            return None
+        if torch.is_grad_enabled() and any(map(_requires_grad, tensors)):
+            return None
 
         def start() -> Start | None:
             base, sized, reach = self._base(source.detach().clone(), values.get("lens"))

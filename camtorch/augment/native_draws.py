@@ -149,7 +149,11 @@ class Start:
             given = np.concatenate(given, None)
             call.values = given.ctypes.data
         elif is_one:
-            given = [n for v in given for n in (v if isinstance(v, list) else (v,))] if self._has_rows else given
+            if self._has_rows:
+                flat: list[float] = []
+                for value in given:
+                    flat += value if isinstance(value, list) else (value,)
+                given = flat
             given = _array(c_double, len(given))(*given)
             call.values = addressof(given)
         # numpy cuts this in half the time of torch
@@ -182,13 +186,13 @@ class Start:
             self._follow(left, call)
         if self._moves and call.followed < rows:
             call.made.limits2 = call.made.extent = None
-        several = () if is_one else (rows,)
         intrinsics, rotation, k = numbers[: 4 * rows], None, self._coefficients
         if self._turns:
-            rotation = torch.from_numpy(numbers[4 * rows : 13 * rows].reshape(*several, 3, 3))
+            rotation = torch.from_numpy(numbers[4 * rows : 13 * rows].reshape((3, 3) if is_one else (rows, 3, 3)))
         if self._moves:
-            k = numbers[13 * rows : (13 + call.count) * rows].reshape(*several, call.count)
-        if several:
+            k = numbers[13 * rows : (13 + call.count) * rows]
+            k = k if is_one else k.reshape(rows, call.count)
+        if not is_one:
             intrinsics = intrinsics.reshape(rows, 4)
         made, serves = None, self._is_flat and not left
         if serves and (self._knows or (not self._moves and native.cameras == rows)):

@@ -26,6 +26,7 @@ from camtorch.warp.samples import Label, MovedField, call_for, natives_of
 from camtorch.warp.sampling import Options, Sampler
 from camtorch.warp.warp import Warp
 
+_PLACES = "pixels", "boxes"
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
 
 
@@ -67,6 +68,7 @@ class SamplePlan:
     masks: Sequence[str]  # names of the masks of validity that come out: "image_valid" and so on
     mask_fill: float
     calls: Kept | None  # the names of the fields that one call of C moves, and the call; None if a graph may want them
+    is_cpu: bool  # whether they lie there
     of_one: bool  # whether cameras are a batch of one, which serves all samples
     has_matrices: bool  # whether some field is a camera matrix
 
@@ -106,16 +108,19 @@ class SamplePlan:
             ways = self._ways(values, options, turns, is_turn)
             chosen = [values[name] for name in ways]
             call = call_for(sizes, source.dtype, options, chosen, [*ways.values()], self.batched) if ways else None
-            names = calls((), settings, lambda: ([*ways], call))[0]
+            others = [n for n, how in ways.items() if how in _PLACES and values[n].dtype != source.dtype]
+            names, others, call = calls((), settings, lambda: ([*ways], others, call))
         else:
-            names, call = known[2]
+            names, others, call = known[2]
         if call is None or (moved := call(source, target, rotation, [*map(values.__getitem__, names)])) is None:
             return {}
-        results: dict[str, MovedField] = {}
-        for name, result in zip(names, moved, strict=True):
-            if result is not None:
-                (rows, valid), dtype = result, values[name].dtype
-                results[name] = rows if rows.dtype == dtype else in_range(rows, dtype), valid
+        results: dict[str, Any] = dict(zip(names, moved, strict=True))
+        if None in moved:
+            results = {name: result for name, result in results.items() if result is not None}
+        for name in others:  # which were computed in the dtype of the cameras
+            if name in results:
+                rows, valid = results[name]
+                results[name] = in_range(rows, values[name].dtype), valid
         return results
 
     def _pixels_at_once(self, part: Part, values: Mapping[str, Any]) -> dict[str, MovedField]:

@@ -220,7 +220,8 @@ class SampleTransform(KeepsCamera, nn.Module):
         camera: instead of the sample's. predicted: values may be bad. kinds: name -> kind, in addition to `fields`.
         """
         camera = sample.get("camera") if camera is None else camera
-        camera = self.camera if camera is None else camera
+        if camera is None and (camera := self._modules.get("camera")) is None:  # where torch looks last
+            camera = self.camera
         fields = {**self.fields, **kinds} if kinds else self.fields
         if isinstance(camera, Guess) and isinstance(self.camera, Camera):  # a front end has brought the number
             camera = self.camera
@@ -265,7 +266,9 @@ class SampleTransform(KeepsCamera, nn.Module):
         flags = dict.fromkeys(["image_valid", *(f"{name}_valid" for name, kind in kinds.items() if kind in IMAGES)])
         masks = [key for key in flags if sample.get(key) is not None or (self.valid_mask and key == "image_valid")]
         calls = Kept() if are_free(*tensors.values()) else None
-        plan = SamplePlan(kinds, batched, count, masks, self.mask_fill, calls, of_one, "K" in kinds.values())
+        plan = SamplePlan(
+            kinds, batched, count, masks, self.mask_fill, calls, device.type == "cpu", of_one, "K" in kinds.values()
+        )
         return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, True)
 
     def _check_matrices(self, batch: Batch, sample: Sample) -> None:

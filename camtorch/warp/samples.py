@@ -191,6 +191,8 @@ class SampleCall:
             else self._vectors(next(turns), value, how)
             for value, how in zip(values, hows, strict=True)
         ]
+        self._left = images if count == 1 else 0  # images that the lattices' call has not made
+        self._is_whole = self._tiles <= _FEW or not self._left  # whether one thread makes all
         self._copied = [  # which values C reads from copies
             i
             for i, (value, how) in enumerate(zip(values, hows, strict=True))
@@ -280,14 +282,13 @@ class SampleCall:
         results: list[MovedField | None] = [
             placed(value, step) for placed, value in zip(self._places, values, strict=True)
         ]
-        native, threads, jobs = loaded(), thread_count(), len(self._jobs)
-        if self._count > 1 and jobs:
+        native, threads = loaded(), thread_count()
+        if self._count > 1 and len(self._jobs):
             run, counters = native.camtorch_lattices, self._lattices.counters
             if run_and_follow(run, call.lattices, self._count, counters, target, source):
                 return None
-            jobs = 0  # the images are made
-        is_whole = threads == 1 or self._tiles <= _FEW or not jobs
-        call.job_count, call.is_whole = jobs, is_whole
+        is_whole = self._is_whole or threads == 1
+        call.job_count, call.is_whole = self._left, is_whole
         while flags := native.camtorch_together(call):
             if flags & structs.LEFT_MOST:
                 return None
