@@ -348,11 +348,11 @@ def on_lattice(
     target that begins again after a whole turn.
     """
     tensors = [*source.tensors, *target.tensors, *(() if rotation is None else (rotation,))]
-    if not is_eager(*tensors):
+    if not is_eager(target.intrinsics):
         return None
     if keeps_graph(*tensors):
         turns = seam_of(target) is not None and target.intrinsics.requires_grad
-        if turns or any(map(_learns_by_parts, (source, target))):
+        if not is_eager(*tensors) or turns or any(map(_learns_by_parts, (source, target))):
             return None
         with torch.no_grad():  # a quarter: errors of positions are larger in derivatives than in images
             found = on_lattice(source, target, rotation, tolerance / 4, rows, padding, learns=True)
