@@ -221,6 +221,8 @@ class CameraDrawer(Augmentation):
             return None
 
         def start() -> Start | None:
+            if not Start.draws(values.keys() - self.beside_the_camera - {"lens"}):
+                return None  # a subclass has a range of its own
             base, sized, reach = self._base(source.detach().clone(), values.get("lens"))
             moves, size = "distortion" in values and base.distortion.shape[-1] > 0, self._size_of(source)
             nominal = self._nominal(base, sized, size, values) if moves else None

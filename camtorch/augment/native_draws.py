@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from ctypes import addressof, c_double, c_float
 from functools import lru_cache, partial
 from typing import Any
@@ -42,6 +42,11 @@ def _array(kind: type[c_double | c_float], count: int) -> Any:
 
 class Start:
     """Cameras that others are drawn from, as native code takes them; kept for as long as their numbers stay."""
+
+    @staticmethod
+    def draws(names: Set[str]) -> bool:
+        """Whether native code knows all ranges of these names."""
+        return names <= _KINDS.keys()
 
     @classmethod
     def of(cls, source: Camera, base: Camera, *numbers: Any) -> Start | None:

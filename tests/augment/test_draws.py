@@ -5,6 +5,7 @@ import torch
 from cameras import DISTINCT, KEYS, slow_unless, spread
 
 import camtorch as ct
+from camtorch.augment.drawer import CameraDrawer
 from camtorch.augment.filling import enough, scaled
 from camtorch.evaluate.kept import Kept
 from camtorch.native.library import native_available
@@ -62,3 +63,18 @@ def test_as_the_formula(key, name, dtype, count, recwarn, monkeypatch):
     monkeypatch.setattr(native_cameras, "_lenses", Kept(1))  # without what the draw found of the lenses
     for one, other in zip(known, found.clone().unproject(pixels), strict=True):
         assert torch.equal(one, other)
+
+
+def test_a_range_that_native_code_does_not_know_is_drawn(monkeypatch):
+    formula = CameraDrawer.new_camera
+
+    def larger(self, source, values):
+        camera, rotation = formula(self, source, values)
+        return scaled(camera, values["factor"]), rotation
+
+    monkeypatch.setattr(CameraDrawer, "new_camera", larger)
+    augmentation = A.RandomMount(yaw=None, pitch=None, roll=None)
+    augmentation.ranges = {**augmentation.ranges, "factor": A.Range(2, 2)}
+    lens = ct.Pinhole.from_fov(70, image_size=(48, 64)).requires_grad_(False)
+    out = augmentation(image=torch.zeros(1, 48, 64), camera=lens)
+    assert out["camera"].intrinsics[0] == 2 * lens.intrinsics[0]
