@@ -8,7 +8,7 @@ from typing import Any
 
 from camtorch.values.stub import listed_names
 
-__version__ = "0.4.0"
+__version__ = "0.5.0"
 
 _PLACES = listed_names(__path__[0])
 """The module or package in which each public name is found."""

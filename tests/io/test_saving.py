@@ -1,5 +1,6 @@
 """Writing files: whole or not at all, in the format that was meant, and nothing lost in silence."""
 
+import json
 import os
 import stat
 
@@ -201,6 +202,16 @@ def test_a_file_of_version_0_2_0_loads():
     lens = camera(distortion=[-0.25, 0.125, 0.0625, -0.03125, 0.5], core=[300.5, 301.25, 319.5, 239.5])
     pose = ct.Extrinsics(float64([0.5, 0, 0]), float64([0, 0.25, 0]))
     assert_same(rig, ct.Rig({"left": lens}, {"left": pose}))
+
+
+def test_a_file_of_version_0_4_0_loads():
+    rig, written = load("camtorch_0.4.0.json"), json.loads((FILES / "camtorch_0.4.0.json").read_text())
+    assert list(rig) == list(written["cameras"])
+    for name, camera in rig.items():
+        assert camera.to_dict().items() >= written["cameras"][name].items()
+        pose = written["extrinsics"][name]
+        assert rig.extrinsics[name].rotation.tolist() == pose["rotation"]
+        assert rig.extrinsics[name].translation.tolist() == pose["translation"]
 
 
 def test_models_that_are_not_there_any_more_name_the_page():

@@ -50,7 +50,7 @@ def test_every_file_of_a_model_states_a_key():
 
 
 def test_every_format_has_a_sample():
-    names = [*MANIFEST, "camtorch_0.2.0.json", "nuscenes/calibrated_sensor.json"]
+    names = [*MANIFEST, "camtorch_0.2.0.json", "camtorch_0.4.0.json", "nuscenes/calibrated_sensor.json"]
     without = {"ocamcalib"}  # tests/models/test_ocamcalib.py writes its files
     assert {load(name).format for name in names} == set(ct.io.FORMATS) - without
 
