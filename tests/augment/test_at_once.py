@@ -259,7 +259,8 @@ def test_odd_samples_as_step_by_step(form, name, monkeypatch):
     expected = augment(sample, camera=camera)
     assert out.keys() == expected.keys()
     for field in expected.keys() - {"camera"}:
-        torch.testing.assert_close(out[field], expected[field], rtol=0, atol=0, equal_nan=True)
+        least = 3e-7 if field == "points" else 0  # torch's matrix product on ARM rounds in an order of its own
+        torch.testing.assert_close(out[field], expected[field], rtol=0, atol=least, equal_nan=True)
 
 
 @pytest.mark.parametrize("name", ["mount", "chain that decides", "flipped chain"])
