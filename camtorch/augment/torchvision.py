@@ -32,7 +32,7 @@ try:
     from torchvision.transforms import v2
 except Exception as error:  # a binary that does not match fails with a RuntimeError
     raise ImportError(
-        "camtorch.augment.torchvision: torchvision must be built for the installed torch "
+        "camtorch.augment.torchvision: torchvision must be installed, and be built for torch "
         f"{torch.__version__}; got {type(error).__name__}: {error}"
     ) from error
 

@@ -171,9 +171,9 @@ def _run(command: list[str], folder: str) -> str:
             errors="replace",
         )
     except OSError as error:
-        raise BuildError(f"{error}\n(of {shlex.join(command)})") from error
+        raise BuildError(f"{error}\n(an error of {shlex.join(command)})") from error
     if done.returncode:
-        raise BuildError(f"{(done.stderr + done.stdout).strip()}\n(of {shlex.join(command)})")
+        raise BuildError(f"{(done.stderr + done.stdout).strip()}\n(an error of {shlex.join(command)})")
     return done.stdout
 
 

@@ -80,7 +80,7 @@ def warn_if_missing() -> None:
 
     _told.add(state())
     if (worker := get_worker_info()) is None or worker.id == 0:
-        warn(f"camtorch's compiled library is {state()}. CAMTORCH_NATIVE=0 in the environment says that it is meant so")
+        warn(f"camtorch's compiled library is {state()}. CAMTORCH_NATIVE=0 in the environment silences this")
 
 
 @functools.cache

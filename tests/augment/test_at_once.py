@@ -1,6 +1,7 @@
 """What native code moves at once, samples and batches, has the very numbers that their change makes step by step."""
 
 import math
+import platform
 from functools import partial
 from itertools import product
 
@@ -59,6 +60,8 @@ def sample_for(dtype):
 
 
 ROUNDED = 0 if native_available() else 1e-4  # torch moves all pixels at once, and rounds the last ones differently
+# on ARM torch's functions round as no code of C does: of a value, and so of a grey level
+ON_ARM = platform.machine() in ("aarch64", "arm64")
 CASES, FEW = list(product(LENSES, AUGMENTATIONS, DTYPES)), {"mount", "chain", "edits"}
 
 
@@ -70,7 +73,8 @@ def test_as_step_by_step(key, name, dtype):
         torch.manual_seed(seed)
         out = augment(sample, camera=camera)
         change, fill = augment.last, augment.mask_fill
-        assert torch.equal(out["image"], change.images(sample["image"][None])[0])
+        levels = out["image"].int() - change.images(sample["image"][None])[0].int()
+        assert levels.abs().max() <= ON_ARM
         assert torch.equal(out["mask"], change.labels(sample["mask"][None, None], fill)[0, 0])
         for field in ("keypoints", "polygons"):
             moved, valid = change.points(sample[field][None])
@@ -259,7 +263,7 @@ def test_odd_samples_as_step_by_step(form, name, monkeypatch):
     expected = augment(sample, camera=camera)
     assert out.keys() == expected.keys()
     for field in expected.keys() - {"camera"}:
-        least = 3e-7 if field == "points" else 0  # torch's matrix product on ARM rounds in an order of its own
+        least = 3e-7 * (ON_ARM and field == "points")
         torch.testing.assert_close(out[field], expected[field], rtol=0, atol=least, equal_nan=True)
 
 

@@ -274,5 +274,5 @@ def test_plain_tensors_and_pil_images(vision):
 
 def test_a_torchvision_that_does_not_load_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "torchvision", None)
-    with pytest.raises(ImportError, match=r"torchvision must be built for .* torch \d.* got"):
+    with pytest.raises(ImportError, match=r"torchvision must be installed, and be built for torch \d.* got"):
         importlib.import_module("camtorch.augment.torchvision")
