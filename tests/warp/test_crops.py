@@ -57,11 +57,15 @@ def test_a_box_without_a_gradient_gives_the_same_crop():
     torch.testing.assert_close(learns.rotation, plain.rotation, rtol=0, atol=1e-12)
     learner = ct.views.look_at(fisheye().requires_grad_(True), boxes(), SIZE)
     assert not learner.target.intrinsics.requires_grad  # the place of the crop counts as given
+    camera = fisheye().requires_grad_(True)
+    both = ct.views.look_at(camera, boxes().requires_grad_(), SIZE)
+    gradients = torch.autograd.grad(both.target.intrinsics.sum(), camera.intrinsics, allow_unused=True)
+    assert gradients == (None,)
 
 
 @pytest.mark.parametrize("count", [None, 2], ids=["one camera", "a camera each"])
 def test_several_crops_of_each_image(count):
-    camera = fisheye() if count is None else ct.cat([fisheye(), fisheye().resize(60, 80).resize(120, 160)])
+    camera = fisheye() if count is None else ct.cat([fisheye(), fisheye().replace(intrinsics=[90.0, 91.0, 75.0, 63.0])])
     many = torch.stack((boxes(), boxes() + 7, boxes().flip(0) - 3), 1).requires_grad_()
     warp, images = ct.views.look_at(camera, many, SIZE), smooth_images(2).requires_grad_()
     made = warp(images)
@@ -113,8 +117,9 @@ def test_shapes_that_could_be_misread_are_refused():
     many[1, 2] = float("nan")
     with pytest.raises(ValueError, match=r"boxes\[1, 2\]"):
         ct.views.look_at(fisheye(), many, SIZE)
-    with pytest.raises(ValueError, match="one for each camera"):
-        ct.views.look_at(fisheye().expand(3), many, SIZE)
+    for count in (1, 3):
+        with pytest.raises(ValueError, match="one for each camera"):
+            ct.views.look_at(fisheye().expand(count), boxes(), SIZE)
 
 
 def test_the_place_of_a_crop():
@@ -129,3 +134,18 @@ def test_the_place_of_a_crop():
     torch.testing.assert_close(ct.views.crop_place(plain)[:3], middle)
     with pytest.raises(TypeError, match="must be a Warp"):
         ct.views.crop_place(camera)
+
+
+def test_a_box_on_the_first_pixel_is_looked_at():
+    rim = torch.tensor([-30.0, -20.0, 0.2, 0.3], dtype=torch.float64)
+    middle, _ = ct.views.look_at(fisheye(), rim, SIZE, margin=0.0).transform_points((rim[:2] + rim[2:]) / 2)
+    torch.testing.assert_close(middle, torch.tensor([15.5, 11.5], dtype=torch.float64))
+
+
+def test_where_a_side_has_no_ray_its_tangent_is_0():
+    lens = ct.KannalaBrandt([8.0, 10.0, 3.5, 11.5], image_size=SIZE).double().requires_grad_(False)
+    seen = lens.unproject(torch.tensor([[-0.5, 11.5], [31.5, 11.5]], dtype=torch.float64))[1]
+    assert seen.tolist() == [True, False]  # to the right the angle is more than pi
+    place = ct.views.crop_place(ct.Warp(fisheye(), lens))
+    assert place[3] == 0
+    assert place[4] > 0

@@ -78,10 +78,13 @@ def test_fill_takes_the_place_of_black(mode):
 def test_pixels_without_a_ray_take_the_fill_in_every_padding_mode():
     behind = ct.KannalaBrandt([40.0, 40, 79.5, 59.5], image_size=SIZE).requires_grad_(False)
     for padding_mode in ("zeros", "border", "reflection"):
-        warp = ct.Warp(pinhole(SIZE, 140.0), behind, turn(60, 0, 0), padding_mode=padding_mode, fill=7.0)
+        options = {"padding_mode": padding_mode, "fill": 7.0}
+        warp = ct.Warp(pinhole(SIZE, 140.0), behind, turn(60, 0, 0), **options)
         without = ~warp.by_pixel().mapped[0]
         assert without.any()
-        assert (warp(torch.rand(1, 1, *SIZE))[0, 0][without] == 7).all()
+        for tolerance in (0.001, 0.0):  # from a lattice, and from positions of all pixels
+            made = warp if tolerance else ct.Warp(warp.source, warp.target, warp.rotation, tolerance=0.0, **options)
+            assert (made(torch.rand(1, 1, *SIZE))[0, 0][without] == 7).all()
 
 
 @pytest.mark.parametrize("small", [False, True])
