@@ -380,3 +380,17 @@ def test_padding_and_fill():
     assert (border[outside] > 0).any()
     # which cells are interpolated depends on the padding: 0.001 px of an image whose pixels differ by 1 at the most
     torch.testing.assert_close(border[inside], black["image"][inside], atol=1e-3, rtol=0)
+
+
+def test_vignetting_reaches_its_share_in_the_farthest_corner():
+    lens = RandomLens(vignetting=0.5, focal=None, centre=None, distortion=None, camera=pinhole((7, 9), 9.0))
+    light = lens(image=torch.ones(3, 7, 9))["image"][0]
+    assert light[0, 0].item() == pytest.approx(0.5, abs=1e-3)
+    assert light[3, 4].item() == pytest.approx(1, abs=1e-3)
+
+
+def test_a_part_of_a_chain_may_be_the_same_on_a_batch():
+    chain = A.Compose([RandomMount(same_on_batch=True), RandomLens()], camera=pinhole(SIZE, 250.0))
+    draw = chain.draw(4)
+    assert len(set(draw["0.yaw"].tolist())) == 1
+    assert len(set(draw["1.focal"].tolist())) == 4

@@ -88,6 +88,7 @@ def test_cameras_and_draws(camera):
         (lambda: mount(given | {"camera": {}}), "camera must be a Camera; got dict"),
         (lambda: mount(given | {"camera": camera.expand(3)}), r"no batch dims, or those of 2 samples; got \(3,\)"),
         (lambda: mount(given | {"camera": [camera]}), "camera must have one for each of 2 samples; got 1"),
+        (lambda: mount(given | {"camera": [camera] * 3}), "camera must have one for each of 2 samples; got 3"),
         (lambda: mount(given, draw=mount.draw(3)), r"for 2 samples; got one for 3\. draw\(2\) makes one for each$"),
         (
             lambda: mount(given, draw=mount.draw(1)),
@@ -163,3 +164,18 @@ def test_labels_that_are_missing_or_just_within_are_taken(camera):
     }
     RandomMount(yaw=5, camera=camera)(sample)
     RandomMount(yaw=5, camera=camera)(head_pose=torch.full((4, 4), math.nan))
+
+
+def test_pitch_ends_at_a_right_angle_and_yaw_at_a_straight_one(camera):
+    mount = RandomMount(camera=camera)
+    assert mount(pitch_yaw=torch.tensor([[1.57, 3.14]]))["pitch_yaw"].shape == (1, 2)
+    for angles in ([2.0, 0.0], [0.0, 3.3]):
+        with pytest.raises(ValueError, match="pitch within pi / 2 and yaw within pi"):
+            mount(pitch_yaw=torch.tensor([angles]))
+
+
+def test_a_pattern_matches_no_shorter_name(camera):
+    mount = RandomMount(camera=camera, fields={"lid*dar": "keep"})
+    assert torch.equal(mount(keypoints=POINTS, lid_dar=torch.ones(2, 9, 3))["lid_dar"], torch.ones(2, 9, 3))
+    with pytest.raises(ValueError, match="'lidar' must have a kind"):
+        mount(keypoints=POINTS, lidar=torch.ones(2, 9, 3))

@@ -217,3 +217,14 @@ def test_several_cameras_of_a_sample_are_flattened():
         mount(image=images.flatten(0, 1), camera=camera.expand(2, 3))
     out = mount(image=images.flatten(0, 1), camera=ct.cat(list(camera.expand(2, 3))))
     assert out["image"].unflatten(0, (2, 3)).shape == images.shape
+
+
+def test_a_crop_turns_away_by_its_own_angles():
+    camera, box = wide().requires_grad_(False), torch.tensor([[100.0, 90, 160, 150]])
+    sample = {"image": torch.zeros(3, *camera.image_size), "boxes": box, "camera": camera}
+    straight = ct.augment.BoxCrop((64, 64))(**sample)["rotation"]
+    turns = dict.fromkeys(("yaw", "pitch", "roll"), (0.0, 0.0))
+    for name in turns:
+        crop = ct.augment.BoxCrop((64, 64), **{**turns, name: (20.0, 20.0)})(**sample)["rotation"]
+        mount = ct.augment.RandomMount(**{**turns, name: (20.0, 20.0)}, min_filled=0)(**sample)["rotation"]
+        torch.testing.assert_close(crop, mount @ straight)

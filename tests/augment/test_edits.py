@@ -369,6 +369,9 @@ def test_light_and_colours_go_through_edits():
     expected = torch.rot90(alone.flip(-1), 1, (-2, -1)).int()
     assert (out[..., 4:-4, 4:-4].int() - expected[..., 1:-1, 1:-1]).abs().max() <= 2
     assert expected.float().std() > 10
+    white = A.RandomLens(vignetting=0.0, focal=None, centre=None, distortion=None, camera=lens)
+    moved = A.Compose([white, A.Pad(5)], padding_mode="border")(image=image)["image"]
+    assert (moved == 200).all()  # no light is lost at a rim that goes on
     with pytest.raises(ValueError, match=r"be edits after chromatic and vignetting.* got RandomLens"):
         A.Compose([shade, A.RandomMount()])
 

@@ -84,3 +84,22 @@ def test_landmarks_of_an_image_of_another_size_are_told_of_once(name, form):
     moved(torch.cat((inside, far)))
     moved(torch.cat((inside[:1], far)), [True, True, False, False])
     moved(torch.full((3, 2), torch.nan))
+
+
+def test_boxes_that_do_not_move_are_valid_where_the_image_is():
+    still, inf = A.HorizontalFlip(p=0), torch.inf
+    boxes = torch.tensor(
+        [[63.3, 9, 80, 20], [63.6, 9, 80, 20], [-9.0, 9, -0.3, 20], [-9.0, 9, -0.6, 20], [0, 0, 9, inf]]
+    )
+    out = still(image=torch.zeros(3, *SIZE), boxes=boxes)
+    assert out["boxes_valid"].tolist() == [True, False, True, False, False]
+    assert torch.equal(out["boxes"], boxes)
+
+
+def test_depth_behind_the_camera_moves_as_its_distance():
+    wide = ct.KannalaBrandt([15.0, 15.0, 31.5, 23.5], image_size=SIZE).requires_grad_(False)  # 120 degrees to the side
+    z = wide.rays()[0][..., 2]
+    out = A.RandomMount(roll=(90, 90), yaw=(0, 0), pitch=(0, 0), camera=wide, min_filled=0)(depth=3 * z[None])
+    found = out["depth"][0]
+    assert (found < -0.5).any()
+    torch.testing.assert_close(found[found != 0], (3 * z)[found != 0], rtol=0, atol=0.2)

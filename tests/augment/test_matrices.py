@@ -324,3 +324,18 @@ def test_a_skew_of_rounding_is_none():
 
 def test_a_guess_is_shown():
     assert "camera=60, yaw" in repr(ct.augment.RandomMount(camera=60))
+
+
+def test_a_camera_of_the_augmentation_comes_before_the_number_of_a_front_end(vision):
+    front_end, tv_tensors = vision
+    transform = front_end.Transform(A.Resize(SIZE, camera=ct.Pinhole.from_fov(90, image_size=SIZE)), 60)
+    transform({"image": tv_tensors.Image(torch.zeros(3, *SIZE))})
+    assert float(transform.last.target.fov[..., 0]) == pytest.approx(90)
+
+
+def test_a_box_crop_that_may_not_apply_leaves_a_lens():
+    lens = A.RandomLens("dms130", fov=70, min_filled=0)
+    fields = {"image": torch.zeros(2, 3, *SIZE), "K": K.expand(2, 3, 3), "boxes": BOXES}
+    assert A.Compose([lens, A.BoxCrop((64, 48))])(**fields)["K"].shape == (2, 3, 3)
+    with pytest.raises(ValueError, match="only pinhole"):
+        A.Compose([lens, A.BoxCrop(SIZE, p=0.5)])(**fields)
