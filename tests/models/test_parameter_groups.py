@@ -63,3 +63,11 @@ def test_the_loss_is_good_only_if_the_camera_is(key, name):
     loss, (pixels, valid) = ct.losses.reprojection(camera, seen, points, penalty=800), camera.project(points)
     off, lost = (pixels - seen).square().sum(-1).mean().sqrt(), 1 - valid.float().mean()
     assert (off < 1 and lost == 0) or (name in ("SGD", "momentum") and loss > max(1, 799 * lost))
+
+
+def test_what_cameras_share_has_the_step_of_the_most_sensitive_one():
+    wide = spread("kannala_brandt").freeze("fx", "fy", "cx", "cy")
+    near = wide.replace(intrinsics=wide.intrinsics.detach() * 0.5)
+    near._parameters["distortion"] = wide._parameters["distortion"]
+    steps = [camera.parameter_groups(lr=0.01)[-1]["lr"] for camera in (wide, near)]
+    assert ct.Mixed([near, wide]).parameter_groups(lr=0.01)[-1]["lr"] == min(steps) < max(steps)

@@ -83,6 +83,8 @@ def test_it_can_be_copied_sent_and_shared():
     for other in (copy.deepcopy(tensor), pickle.loads(pickle.dumps(tensor)), tensor.clone()):
         assert torch.equal(other, tensor)
         assert other.data_ptr() != tensor.data_ptr()
+    odd = made(shape=(3, 301, 401))  # which ends within a page
+    assert odd.untyped_storage().nbytes() == odd.nbytes
     place = tensor.data_ptr()
     assert torch.equal(tensor.share_memory_(), torch.full(SHAPE, 3.0))
     assert made().data_ptr() == place  # which sharing has left

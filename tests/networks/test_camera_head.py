@@ -249,3 +249,14 @@ def test_the_error_of_an_export_to_onnx_says_what_exports():
     head = ct.CameraHead(4, "brown_conrady", image_size=(48, 64)).eval()
     with pytest.raises(Exception, match=r"'pinhole' in torch.onnx.export; got BrownConrady. Export.*up to head.linear"):
         torch.onnx.export(head, (torch.zeros(2, 4),), dynamo=True, verbose=False)
+
+
+def test_the_centre_moves_by_parts_of_its_own_side_and_in_full_precision():
+    layer = head("pinhole", centre=0.1)
+    far = layer.camera(torch.tensor([0.0, 1e9, 1e9]))
+    torch.testing.assert_close(far.intrinsics[2:] - layer.prior.intrinsics[2:], torch.tensor([64.0, 48.0]))
+    layer = random(layer, 1.0, torch.Generator().manual_seed(0))
+    features = torch.randn(4, 16, generator=torch.Generator().manual_seed(1))
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = layer(features)
+    assert torch.equal(mixed.intrinsics, layer.camera(layer.linear(features)).intrinsics)
