@@ -127,3 +127,22 @@ def test_what_does_not_fit_a_clip_is_told_by_name(fields, says):
         mount.moved_by(mount.change(None, mount.draw(3)), {"image": torch.zeros(B, T, 3, *SIZE)})
     with pytest.raises(ValueError, match=r"FaceNormalizer: image must be \(B, C, H, W\); .* image.flatten\(0, 1\)"):
         A.FaceNormalizer(camera=camera())(image=torch.zeros(B, T, 3, *SIZE), head_pose=torch.eye(4))
+
+
+def test_an_image_tells_a_sample_of_several_faces_from_a_batch_in_any_order():
+    camera = ct.Pinhole.from_fov(60, image_size=(30, 40)).requires_grad_(False)
+    out = A.RandomMount(camera=camera)(keypoints=torch.ones(4, 5, 2), image=torch.zeros(3, 30, 40))
+    assert out["keypoints"].shape == (4, 5, 2)
+    assert out["camera"].batch_shape == ()
+
+
+def test_lists_of_labels_move_by_the_cameras_of_several_models():
+    lens = ct.KannalaBrandt([30.0, 30.0, 19.5, 14.5], image_size=(30, 40)).requires_grad_(False)
+    cameras = [ct.Pinhole.from_fov(fov, image_size=(30, 40)).requires_grad_(False) for fov in (50, 90)]
+    cameras.insert(1, lens)
+    mount, points = A.RandomMount(), [torch.rand(n, 2) * 30 for n in (2, 3, 4)]
+    draw = mount.draw(3)
+    moved = mount(keypoints=points, camera=cameras, draw=draw)["keypoints"]
+    for i, (camera, one) in enumerate(zip(cameras, points, strict=True)):
+        alone = mount(keypoints=one[None], camera=camera, draw={n: v[i : i + 1] for n, v in draw.items()})
+        torch.testing.assert_close(moved[i], alone["keypoints"][0])

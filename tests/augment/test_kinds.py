@@ -51,7 +51,7 @@ def test_the_name_tells_the_form_and_what_does_not_move_keeps_its_bits(form):
     still, flipped, image = A.HorizontalFlip(p=0), A.HorizontalFlip(p=1), torch.zeros(3, *SIZE)
     boxes = torch.rand(5, 4, generator=torch.Generator().manual_seed(0)) * 40
     x = 63 - boxes[:, :1] - (boxes[:, 2:3] if form == "xywh" else 0)
-    for name in (f"boxes_{form}", f"boxes_face_{form}"):
+    for name in (f"boxes_{form}", f"boxes_face_{form}", f"boxes_{form}_face"):
         for given in (boxes, boxes.half()):
             assert torch.equal(still({"image": image, name: given})[name], given)
             out = flipped({"image": image, name: given})[name]

@@ -71,3 +71,8 @@ def test_what_cameras_share_has_the_step_of_the_most_sensitive_one():
     near._parameters["distortion"] = wide._parameters["distortion"]
     steps = [camera.parameter_groups(lr=0.01)[-1]["lr"] for camera in (wide, near)]
     assert ct.Mixed([near, wide]).parameter_groups(lr=0.01)[-1]["lr"] == min(steps) < max(steps)
+
+
+def test_a_number_without_an_effect_moves_little():
+    lens = ct.FOV([300.0, 300.0, 320.0, 240.0], [0.0], image_size=(480, 640))
+    assert lens.parameter_groups(lr=0.01)[1]["lr"] == pytest.approx(1e-5)

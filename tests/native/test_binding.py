@@ -13,7 +13,7 @@ from test_build import compiles
 
 import camtorch as ct
 from camtorch.native import build as building
-from camtorch.native import headers, self_test, structs
+from camtorch.native import headers, sampler, self_test, structs
 from camtorch.native.library import library, native_available
 from camtorch.projection import native_calls
 from camtorch.projection.evaluation import camera_rows
@@ -98,3 +98,9 @@ def test_a_library_that_python_does_not_know_is_refused_with_words(tmp_path, mon
     found, why = inspect.unwrap(loading._find)()
     assert found is None
     assert says in why
+
+
+def test_a_lattice_has_the_cells_of_its_pixels():
+    nodes, exact = torch.zeros(1, 2, 7, 7), torch.zeros(2, 0, 8, 8)
+    with pytest.raises(ValueError, match=r"cells must be those of \(16, 17\) pixels; got \(2, 2\)"):
+        sampler.lay(nodes, torch.zeros(1, 2, 2, dtype=torch.int32), exact, (16, 17))

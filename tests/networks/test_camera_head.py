@@ -253,7 +253,7 @@ def test_the_error_of_an_export_to_onnx_says_what_exports():
 
 def test_the_centre_moves_by_parts_of_its_own_side_and_in_full_precision():
     layer = head("pinhole", centre=0.1)
-    far = layer.camera(torch.tensor([0.0, 1e9, 1e9]))
+    far = layer.camera(torch.tensor([0.0, torch.inf, torch.inf]))
     torch.testing.assert_close(far.intrinsics[2:] - layer.prior.intrinsics[2:], torch.tensor([64.0, 48.0]))
     layer = random(layer, 1.0, torch.Generator().manual_seed(0))
     features = torch.randn(4, 16, generator=torch.Generator().manual_seed(1))

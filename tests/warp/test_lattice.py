@@ -270,3 +270,9 @@ def test_second_derivatives_of_warps_that_learn_are_those_of_the_lattice():
             rough = second
     for r, s in zip(rough, second, strict=True):
         assert (r - s).norm() <= 1e-3 * s.norm()
+
+
+@pytest.mark.skipif(not native_available(), reason="no compiled library")
+def test_gradients_of_positions_may_lie_in_any_order_in_memory():
+    cells, by = torch.full((1, 3, 4), CELL_CUBIC, dtype=torch.int32), torch.rand(2, 1, 24, 32).movedim(0, -1)
+    assert torch.equal(sampler.lay_vjp(by, cells, 0)[0], sampler.lay_vjp(by.contiguous(), cells, 0)[0])
