@@ -255,11 +255,13 @@ def _mask_sampler(options: Options, mask_fill: float) -> Sampler:
     return Sampler("nearest", "zeros", (mask_fill,))
 
 
-_MANY = 16
+_MOST_DIMS = 16
 _points, _boxes, _positions, _rays = _by(Change.points), _by(Change.boxes), _by(Change.positions), _by(Change.rays)
 _pitch_yaw, _rotation = _by(Change.rays, from_pitch_yaw, to_pitch_yaw), _by(Change.rays, _columns, _columns)
 _labels = _planes(lambda change, masks, options: change.labels(masks, options["mask_fill"]))
-_DIRECTIONS = Field(1, _MANY, (3,), "(B, *N, 3) directions of the camera frame", _rays, hint=_rays_hint, way="rays")
+_DIRECTIONS = Field(
+    1, _MOST_DIMS, (3,), "(B, *N, 3) directions of the camera frame", _rays, hint=_rays_hint, way="rays"
+)
 _DEPTHS = "(B, 1, H, W) or (B, H, W), along"
 _KEYPOINTS = "(B, N, 2) or (B, F, N, 2) pixels x, y"
 _LANDMARKS = "(B, N, 2) pixels or (B, N, 3) points of the camera frame"
@@ -286,10 +288,12 @@ KINDS = {
     "boxes_xywh": _sided_boxes("boxes_xywh", "x, y, width, height"),
     "boxes_cxcywh": _sided_boxes("boxes_cxcywh", "x and y of the centre, width, height"),
     "landmarks": Field(2, 3, (2, 3), _LANDMARKS, _points, decides=True, in_pixels=True, hint=_landmarks_hint),
-    "points": Field(1, _MANY, (3,), "(B, *N, 3) points of the camera frame", _positions, hint=_column_hint, way="rays"),
+    "points": Field(
+        1, _MOST_DIMS, (3,), "(B, *N, 3) points of the camera frame", _positions, hint=_column_hint, way="rays"
+    ),
     "gaze": _DIRECTIONS,
     "directions": _DIRECTIONS,
-    "pitch_yaw": Field(1, _MANY, (2,), _GAZE, _pitch_yaw, check=_check_pitch_yaw),
+    "pitch_yaw": Field(1, _MOST_DIMS, (2,), _GAZE, _pitch_yaw, check=_check_pitch_yaw),
     "head_pose": _POSE,
     "pose": _POSE,
     "rvec": Field(
@@ -317,7 +321,11 @@ _RANKS = {kind: (not field.decides, i) for i, (kind, field) in enumerate(KINDS.i
 
 
 def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single: bool = False) -> str | None:
-    """Return a field's key in `KINDS`, None if it is not moved; raise if it may be geometry of unknown name."""
+    """Return a field's key in `KINDS`, None if it is not moved; raise if it may be geometry of unknown name.
+
+    In this order: the name among the option `fields`; names that end with _valid do not move; a kind's name or an
+    alias; a pattern with * among `fields`; the longest kind that begins the name; the forms of boxes that end it.
+    """
     if not isinstance(name, str):
         raise TypeError(f"{owner}: a sample must have strings for names; got {name!r:.80}")
     if name in own:

@@ -26,7 +26,7 @@ from camtorch.warp.samples import Label, MovedField, call_for, natives_of
 from camtorch.warp.sampling import Options, Sampler
 from camtorch.warp.warp import Warp
 
-_PLACES = "pixels", "boxes"
+_OUTLINES = "pixels", "boxes"
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
 
 
@@ -79,7 +79,8 @@ class SamplePlan:
     def together(self, change: Change, values: Mapping[str, Any]) -> dict[str, MovedField]:
         """Move by one call of C: images, pixels, and for a single sample boxes and rays.
 
-        The other fields, and all of them if no call serves, are not in the result.
+        Without the library, pixels and boxes move by one evaluation in torch. The other fields, and all of them if no
+        call serves, are not in the result.
         """
         part, calls = change.parts[0], self.calls
         moves = part.moves
@@ -108,7 +109,7 @@ class SamplePlan:
             ways = self._ways(values, options, turns, is_turn)
             chosen = [values[name] for name in ways]
             call = call_for(sizes, source.dtype, options, chosen, [*ways.values()], self.batched) if ways else None
-            others = [n for n, how in ways.items() if how in _PLACES and values[n].dtype != source.dtype]
+            others = [n for n, how in ways.items() if how in _OUTLINES and values[n].dtype != source.dtype]
             names, others, call = calls((), settings, lambda: ([*ways], others, call))
         else:
             names, others, call = known[2]

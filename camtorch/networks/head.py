@@ -169,7 +169,7 @@ class CameraHead(GeometryModule):
         half = self._ratio.to(rows) / 2
         half = half if self.shared_focal else half + _ASPECT / 2 * _bound(given[:, 1:2])
         height, width = self.image_size
-        centre = self._middle.to(rows).expand(len(rows), 2)
+        centre = self._middle.to(rows).expand(rows.shape[0], 2)
         if self._centres:
             reach = rows.new_tensor([width, height])[self._centres] * self.centre
             moved = reach * _bound(given[:, first - len(self._centres) :])
@@ -183,7 +183,8 @@ class CameraHead(GeometryModule):
 
     def _moves(self, limits: Limits, numbers: Tensor, disc: Tensor) -> Tensor:
         """Return offsets (R, n) from the given coefficients for numbers (R, free) and logarithms (R, 1) of discs."""
-        none = numbers.new_zeros(len(numbers), len(limits.given))
+        # len(numbers) would be a constant in torch.export
+        none = numbers.new_zeros(numbers.shape[0], len(limits.given))
         if not self._coefficients:
             return none
         if torch.onnx.is_in_onnx_export():  # which has no cummax

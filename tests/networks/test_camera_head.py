@@ -244,6 +244,23 @@ def test_heads_of_no_features_and_on_the_meta_device(model):
     assert head.to("meta")(torch.randn(2, 8, device="meta")).batch_shape == (2,)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["pinhole", "brown_conrady"])
+def test_heads_export_with_any_number_of_rows(model):
+    class Numbers(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.head = ct.CameraHead(8, model, image_size=SIZE)
+
+        def forward(self, features):
+            return self.head(features).intrinsics
+
+    module, rows = Numbers(), {0: torch.export.Dim("rows", min=2)}
+    program = torch.export.export(module, (torch.randn(4, 8),), dynamic_shapes=(rows,)).module()
+    features = torch.randn(5, 8)
+    torch.testing.assert_close(program(features), module(features))
+
+
 def test_the_error_of_an_export_to_onnx_says_what_exports():
     pytest.importorskip("onnxscript")
     head = ct.CameraHead(4, "brown_conrady", image_size=(48, 64)).eval()
