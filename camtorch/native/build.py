@@ -40,6 +40,7 @@ REASON = "_sampler.reason.txt"
 _FLAGS = ["-std=gnu11", "-O3", "-fvisibility=hidden"]
 _FLAGS += ["-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"]
 _FLAGS += [] if _SUFFIX == "dll" else ["-fPIC"]
+_FLAGS += ["-fno-asynchronous-unwind-tables"] if _SUFFIX == "so" else []  # C has no exceptions to unwind
 _AVX2 = ("-mavx2", "-mfma", "-mf16c", "-mbmi2")
 _AVX512 = ("-mavx512f", "-mavx512vl", "-mavx512bw", "-mavx512dq", "-mavx512vbmi")
 # the kinds of CPU that have code of their own, and its options; every library has the first
