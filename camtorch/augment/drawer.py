@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, ClassVar, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
@@ -23,7 +22,7 @@ from camtorch.augment.ranges import Range, RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.catalogue import ELSEWHERE
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.tensors import are_numbers, known_false, with_derivatives_of
+from camtorch.evaluate.tensors import are_numbers, hold_numbers, known_false, with_derivatives_of
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.models import MODELS, KannalaBrandt, Pinhole
 from camtorch.native.structs import AMOUNTS
@@ -59,8 +58,6 @@ _LIMITS: dict[str, dict[str, Any]] = {
 _EXACT = "fov", "crop", "vignetting", "cos4"  # a single number is a range of only that number
 _AUTO = "focal", "centre", "distortion", "crop"
 _told: set[tuple[object, ...]] = set()
-_PLAIN = frozenset((Tensor, nn.Parameter))
-_is_cpu, _requires_grad = map(operator.attrgetter, ("is_cpu", "requires_grad"))
 
 
 class LensOptions(EditOptions, total=False):
@@ -213,11 +210,7 @@ class CameraDrawer(Augmentation):
         tensors = (source.intrinsics, source.distortion) if like is None else (*source.tensors, *like.tensors)
         # numbers come where nothing is recorded; without any, it is asked
         first = next(iter(values.values()), None)
-        if isinstance(first, Tensor) or (first is None and not are_numbers()):
-            return None
-        if not _PLAIN.issuperset(map(type, tensors)) or not all(map(_is_cpu, tensors)):
-            return None
-        if torch.is_grad_enabled() and any(map(_requires_grad, tensors)):
+        if isinstance(first, Tensor) or (first is None and not are_numbers()) or not hold_numbers(tensors):
             return None
 
         def start() -> Start | None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
@@ -69,7 +72,15 @@ def are_numbers(*tensors: Tensor) -> bool:
     return are_free(*tensors) and _PLAIN.issuperset(map(type, tensors))
 
 
+def hold_numbers(tensors: Sequence[Tensor]) -> bool:
+    """Whether `are_numbers`, in less time, if it is known that nothing is traced or transformed."""
+    if not (_PLAIN.issuperset(map(type, tensors)) and all(map(_is_cpu, tensors))):
+        return False
+    return not (torch.is_grad_enabled() and any(map(_requires_grad, tensors)))
+
+
 _PLAIN = frozenset((Tensor, nn.Parameter))
+_is_cpu, _requires_grad = map(operator.attrgetter, ("is_cpu", "requires_grad"))  # without loops of Python
 
 
 def is_kept(value: Tensor) -> bool:

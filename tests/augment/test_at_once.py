@@ -13,6 +13,7 @@ from cameras import slow_unless
 import camtorch as ct
 import camtorch.augment.numpy
 import camtorch.augment.plan
+from camtorch.augment.sample import Single
 from camtorch.evaluate.kept import Kept
 from camtorch.native.library import native_available
 from camtorch.poses.rotations import rotation_matrix, rotation_vector
@@ -247,6 +248,22 @@ def odd_samples():
         },
         "given flags": {"image": image, "keypoints": pixels[:, None], "keypoints_valid": torch.arange(9)[:, None] % 2},
     }
+
+
+def test_what_is_kept_of_a_form_serves_no_other():
+    """Images of one shape lie in memory in several ways here; labels alone are a batch, or of a face, by the type."""
+    camera = example("brown_conrady", SIZE).requires_grad_(False)
+    used, fresh = A.RandomMount(camera=camera), partial(A.RandomMount, camera=camera)
+    odd = [odd_samples()[name] for name in ("gaps", "expanded", "turned in memory")]
+    whole = [{name: value.contiguous() for name, value in form.items()} for form in odd]
+    faces = {"keypoints": odd[0]["keypoints"][None]}
+    for sample in [*whole, *odd, faces, Single(faces), *whole]:
+        outs = []
+        for augment in (used, used, fresh()):
+            torch.manual_seed(0)
+            outs.append(augment(sample))
+        for out, name in product(outs[:2], {*sample, "keypoints_valid", "rotation"}):
+            assert torch.equal(out[name], outs[2][name])
 
 
 @pytest.mark.parametrize("name", ["mount", "lens", "chain that decides", "flipped chain"])

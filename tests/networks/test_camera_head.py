@@ -116,6 +116,16 @@ def test_a_given_camera_is_the_prior(camera):
     assert (near.fx / camera.fx).log().abs().max() < 0.2
 
 
+@pytest.mark.parametrize("fov", [(60, 100), (100, 140)])
+def test_a_camera_at_an_end_of_the_range_is_the_prior(fov):
+    camera = ct.Pinhole.from_fov(100, image_size=SIZE)
+    layer = ct.CameraHead(4, camera, fov=fov)
+    torch.testing.assert_close(layer.camera(torch.zeros(len(layer.names))).fov[0], camera.fov[0], rtol=1e-4, atol=0)
+    made = layer(torch.randn(5, 4))
+    made.fx.sum().backward()
+    assert all(values.isfinite().all() for values in (made.intrinsics, layer.linear.weight.grad))
+
+
 def test_one_moves_the_rim_by_a_tenth():
     for key in ("brown_conrady", "fisheye624", "ucm"):
         layer = head(key).double()

@@ -94,6 +94,15 @@ def test_several_crops_of_each_image(count):
     assert warp.detach()(images.detach().movedim(1, -1).numpy()).shape == (2, 3, *SIZE, 1)
 
 
+def test_options_that_change_after_use_count():
+    warp, images = ct.views.look_at(fisheye(), boxes()[:, None], SIZE), smooth_images(2)
+    warp(images)
+    fresh = ct.views.look_at(fisheye(), boxes()[:, None], SIZE)
+    for each in (warp, fresh):
+        each.mode, each.fill = "nearest", (7.0,)
+    torch.testing.assert_close(warp(images), fresh(images), rtol=0, atol=0)
+
+
 def test_no_crops_of_some_images():
     warp = ct.views.look_at(fisheye(), boxes().new_zeros(2, 0, 4), SIZE)
     for images in (smooth_images(2), smooth_images(1), smooth_images(2)[:, None].expand(-1, 0, -1, -1, -1)):
