@@ -324,7 +324,7 @@ class Bundle:
         state = self.state(flat)
         searched = self.camera(c, state)
         camera = fixed_camera(kind, searched.intrinsics, searched.distortion)
-        camera._warned = True
+        camera._expects_unusable = True
         return errors.valid & camera.project(self.points(c, state, self.observed[c])[-1])[1]
 
     def observed_by(self, c: int, rows: Tensor | None) -> CameraObservations:
@@ -455,7 +455,7 @@ def _of_rows(values: Tensor, rows: Tensor) -> Tensor:
 def _template(model: type[Camera], parameters: Tensor) -> Camera:
     """Return a frozen camera of the model, a template for others with its number of coefficients."""
     made = fixed_camera(model.model_for_search(), parameters[0, :4], parameters[0, 4:])
-    made._warned = True  # a rejected step may have gone anywhere, and must not warn
+    made._expects_unusable = True  # a rejected step may have gone anywhere, and must not warn
     return made
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import torch
@@ -24,8 +25,9 @@ from camtorch.evaluate.tensors import is_predicted, values_of
 from camtorch.optics.model_spec import ModelSpec
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.projection.camera_like import CameraLike
-from camtorch.projection.evaluation import evaluate_points, evaluate_rows
+from camtorch.projection.evaluation import camera_rows, evaluate_points, evaluate_rows
 from camtorch.projection.project import PROJECT
+from camtorch.projection.rows import Direction
 from camtorch.projection.unproject import UNPROJECT
 from camtorch.rays.depth import backproject
 from camtorch.rays.explanation import explain
@@ -132,7 +134,7 @@ class Camera(Freezable, Editable):
             distortion_names=names,
             image_size=size,
             **{name: Kept() for name in self.memo_names},
-            _warned=is_predicted(intrinsics) or is_predicted(distortion),
+            _expects_unusable=is_predicted(intrinsics) or is_predicted(distortion),
         )
         self.hold("intrinsics", intrinsics, (*batch, 4))
         self.hold("distortion", distortion, (*batch, distortion.shape[-1]))
@@ -388,7 +390,10 @@ class Camera(Freezable, Editable):
         """
         return project_polyline(self, points, extrinsics)
 
-    _evaluate = evaluate_rows
+    def _evaluate(
+        self, direction: Direction, rows: Tensor, lead: torch.Size, tensors: Sequence[Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        return evaluate_rows(type(self), direction, rows, lead, tensors, partial(camera_rows, self), self)
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:

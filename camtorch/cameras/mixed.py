@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import accumulate, product
 from typing import Any, NamedTuple, NoReturn, cast
 
@@ -18,7 +19,7 @@ from camtorch.cameras.numbers import as_numbers_of
 from camtorch.evaluate.door import COLLATE_FUNCTIONS
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import in_worker
-from camtorch.projection.evaluation import camera_rows, kept_cameras, per_row
+from camtorch.projection.evaluation import camera_rows, evaluate_rows, kept_cameras
 from camtorch.projection.rows import CameraRows, Direction
 from camtorch.values.arguments import Numbers, as_image_size, as_points, no_camera, shown, working_dtype
 from camtorch.values.module import refused_index, remade
@@ -59,6 +60,7 @@ class Mixed(Camera):
     """
 
     is_mixed = True
+    has_native_form = False
     cameras: nn.ModuleList
     """The cameras that it was made of: single ones and batches."""
 
@@ -168,42 +170,31 @@ class Mixed(Camera):
         return tensor.index_select(dim, torch.tensor(self._order, device=tensor.device))
 
     def _evaluate(
-        self,
-        direction: Direction,
-        rows: Tensor,
-        lead: torch.Size,
-        tensors: Sequence[Tensor],
-        cameras_of: Callable[[Tensor, Tensor], CameraRows] | None = None,
+        self, direction: Direction, rows: Tensor, lead: torch.Size, tensors: Sequence[Tensor]
     ) -> tuple[Tensor, Tensor]:
         results = []
-        for n, (group, pair) in enumerate(zip(self._groups, self._pairs(tensors), strict=True)):
+        for group, pair in zip(self._groups, self._pairs(tensors), strict=True):
             here, count = rows, lead
             if len(self._groups) > 1:
                 start, stop = group.rows[0], group.rows[-1] + 1
                 contiguous = stop - start == len(group.rows)
                 index = slice(start, stop) if contiguous else torch.tensor(group.rows, device=rows.device)
                 here, count = rows[index], torch.Size((len(group.rows),))
-            of_model = self._member(group.members[0])
-            results.append(of_model._evaluate(direction, here, count, pair, self._watch(n)))
+            cameras_of = partial(self._kept_cameras, group)
+            results.append(evaluate_rows(group.model, direction, here, count, pair, cameras_of, None))
         if len(results) == 1:
             return results[0]
         planes, valid = zip(*results, strict=True)
         return self._in_order(torch.cat(planes, 1), 1), self._in_order(torch.cat(valid))
 
-    def _watch(self, n: int) -> Callable[[Tensor, Tensor], CameraRows]:
-        """Return a function that gives a group's cameras, kept until a value changes; unusable members warn."""
-        group = self._groups[n]
-
-        def cameras(intrinsics: Tensor, distortion: Tensor) -> CameraRows:
-            found = kept_cameras(group.memo, group.model, intrinsics, distortion)
-            if found.usable is not None:
-                for member in map(self._member, group.members):
-                    if not (member._warned or member._told):
-                        lead = member.batch_shape
-                        camera_rows(member, *(per_row(t.to(intrinsics), lead, t) for t in member.tensors))
-            return found
-
-        return cameras
+    def _kept_cameras(self, group: _Group, intrinsics: Tensor, distortion: Tensor) -> CameraRows:
+        """Return a group's cameras, kept until a value changes; unusable members warn."""
+        found = kept_cameras(group.memo, group.model, intrinsics, distortion)
+        if found.usable is not None:
+            for member in map(self._member, group.members):
+                if not (member._expects_unusable or member._told):
+                    camera_rows(member, *(t.expand(*member.batch_shape, t.shape[-1]) for t in member.tensors))
+        return found
 
     def explain(self, points: Numbers) -> list[str]:
         """Explain in words why points (B, *N, 3) have no pixel; see `Camera.explain`."""

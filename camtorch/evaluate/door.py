@@ -202,14 +202,13 @@ class Way(NamedTuple):
     learns: bool  # autograd records the native call, with its derivatives
     is_known: bool  # the values of the parameters may be read, so that results made of them are kept
     order: int  # of the derivatives that the recorded formula must have exactly
-    is_constant: bool = False  # the module is a constant of the exported program
 
 
 _NATIVE, _LEARNING = Way(True, False, True, 2), Way(True, True, True, 2)
 
 
-def way_of(module: nn.Module, values: Tensor, *parameters: Tensor) -> Way:
-    """Return the way of a module's call with values and parameters; raise a RuntimeError if torch can record none."""
+def way_of(owner: str, values: Tensor, *parameters: Tensor) -> Way:
+    """Return the way of a call with values and parameters; raise a RuntimeError if torch can record none."""
     # called once a call, so all in one place: each further function would take as long as its question
     is_plain = not (
         torch.compiler.is_compiling()
@@ -224,7 +223,7 @@ def way_of(module: nn.Module, values: Tensor, *parameters: Tensor) -> Way:
     if is_plain:
         if in_jit_trace() and torch.onnx.is_in_onnx_export():
             raise RuntimeError(
-                f"{type(module).__name__}: dynamo must be True in torch.onnx.export of a camera; got False. "
+                f"{owner}: dynamo must be True in torch.onnx.export of a camera; got False. "
                 "Results that a frozen camera or warp keeps are constants: camera.rays() and warp(images), with "
                 "requires_grad_(False) and called once before the export"
             )
@@ -232,7 +231,7 @@ def way_of(module: nn.Module, values: Tensor, *parameters: Tensor) -> Way:
             return _LEARNING if learns and torch.is_grad_enabled() else _NATIVE
     is_known = all(is_concrete(t) and not has_tangent(t) for t in parameters)
     # torch.compile records no derivatives of derivatives
-    return Way(False, False, is_known, 1 if torch.compiler.is_compiling() else 2, is_constant(module))
+    return Way(False, False, is_known, 1 if torch.compiler.is_compiling() else 2)
 
 
 def is_native(values: Tensor) -> bool:

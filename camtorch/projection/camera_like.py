@@ -17,11 +17,13 @@ class CameraLike(ModelSpec, BatchedModule):
 
     is_mixed: ClassVar[bool] = False
     """Whether it is a batch of several models, which do not share coefficients; see `Mixed`."""
+    has_native_form: ClassVar[bool] = True
+    """Whether native code may know it as one `Native`: not several models, nor a camera behind a shutter."""
     image_size: tuple[int, int] | None
     _memo: Kept
     _rays: Kept
     _fields: Kept
-    _warned: bool  # whether unusable numbers are expected, as a network's
+    _expects_unusable: bool = False  # as of a network's numbers, or of those that a fit tries
     _told: bool = False  # whether a call has warned of them
 
     if TYPE_CHECKING:
@@ -52,6 +54,4 @@ class CameraLike(ModelSpec, BatchedModule):
 
         def pixel_grid(self, stride: int = 1) -> Tensor: ...
 
-        def _evaluate(
-            self, direction: Any, rows: Tensor, lead: Any, tensors: Any, cameras_of: Any = None
-        ) -> tuple[Tensor, Tensor]: ...
+        def _evaluate(self, direction: Any, rows: Tensor, lead: Any, tensors: Any) -> tuple[Tensor, Tensor]: ...

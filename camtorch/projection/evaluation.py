@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.nn.utils import parametrize
 
-from camtorch.evaluate.door import is_native, way_of
+from camtorch.evaluate.door import is_constant, is_native, way_of
 from camtorch.evaluate.export import portable_export, with_values
 from camtorch.evaluate.kept import Kept, same
 from camtorch.evaluate.tensors import are_free
@@ -50,28 +50,30 @@ def evaluate_points(camera: CameraLike, direction: Direction, values: Numbers) -
 
 
 def evaluate_rows(
-    camera: CameraLike,
+    model: type[CameraLike],
     direction: Direction,
     rows: Tensor,
     lead: torch.Size,
     tensors: Sequence[Tensor],
-    cameras_of: Callable[[Tensor, Tensor], CameraRows] | None = None,
+    cameras_of: Callable[[Tensor, Tensor], CameraRows],
+    constant: CameraLike | None,
 ) -> tuple[Tensor, Tensor]:
-    """Return planes (size, C, N), and valid (C, N), for rows (C, N, size) seen by cameras of this model.
+    """Return planes (size_out, C, N), and valid (C, N), for rows (C, N, size) seen by cameras of a model.
 
     It decides whether native code or torch evaluates a direction; `compiled_of` decides for warps, poses and boards.
-    `lead` are the batch dims that C counts. `cameras_of` returns results kept of other tensors than this camera's.
+    The cameras have the `tensors` (*B, 4) and (*B, n); `lead` are the batch dims that C counts. `cameras_of` returns
+    the results kept of them as (C, 4) and (C, n). `constant` is the camera that they are of, if an exported program
+    may hold it as a constant.
     """
-    intrinsics, distortion = per_row(tensors[0], lead, rows), per_row(tensors[1], lead, rows)
+    intrinsics, distortion = per_row(tensors, lead, rows)
     inputs = rows, intrinsics, distortion
-    way = way_of(camera, *inputs)
-    if way.is_constant and cameras_of is None and all(isinstance(side, int) for side in lead):
-        with with_values(camera):
-            intrinsics, distortion = (per_row(t, lead, rows) for t in camera.tensors)
-            cameras = camera_rows(camera, intrinsics, distortion).with_all_tables()
+    way = way_of(model.__name__, *inputs)
+    if constant is not None and not way.is_native and is_constant(constant) and all(type(side) is int for side in lead):
+        with with_values(constant):
+            intrinsics, distortion = per_row(constant.tensors, lead, rows)
+            cameras = cameras_of(intrinsics, distortion).with_all_tables()
         with portable_export(rows) as order:
-            return direction.formula(type(camera), rows, intrinsics, distortion, cameras, order)
-    cameras_of = cameras_of or partial(camera_rows, camera)
+            return direction.formula(model, rows, intrinsics, distortion, cameras, order)
     known = cameras_of(intrinsics, distortion) if way.is_known else None
     if way.is_native and known is not None and (made := known.native) is not None:
         if way.learns:
@@ -81,12 +83,12 @@ def evaluate_rows(
         return planes, valid
     if way.is_native and rows.shape[0] * rows.shape[1] >= _MANY:
         warn_if_missing()
-    formula = partial(direction.formula, type(camera))
+    formula = partial(direction.formula, model)
     if known is None or rows.shape[0] * rows.shape[1] <= _BLOCK or not are_free(*inputs):
         return formula(*inputs, known, way.order)
     # block by block, which stay in a cache from one operation to the next
     step = max(_BLOCK * torch.get_num_threads() // len(rows), 1)
-    planes = rows.new_empty(5 - rows.shape[2], *rows.shape[:2])
+    planes = rows.new_empty(direction.size_out, *rows.shape[:2])
     valid = torch.empty(planes.shape[1:], dtype=torch.bool, device=planes.device)
     for i in range(0, rows.shape[1], step):
         part = slice(i, i + step)
@@ -101,7 +103,7 @@ def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Na
     """
     pairs, dtype, is_batch, inputs = [], values[0].dtype, False, [*values]
     for camera in cameras:
-        if not isinstance(camera, nn.Module) or camera.is_mixed:
+        if not camera.has_native_form:
             return None
         pairs.append(camera.tensors)
         inputs += pairs[-1]
@@ -164,7 +166,7 @@ def camera_rows(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> C
     """Return the rows' cameras, kept until a value changes."""
     cameras = kept_cameras(camera._memo, type(camera), intrinsics, distortion)
     # reading values would wait for another device
-    if cameras.usable is not None and cameras.usable.is_cpu and not (camera._warned or camera._told):
+    if cameras.usable is not None and cameras.usable.is_cpu and not (camera._expects_unusable or camera._told):
         # warn once if learning drove this module's Parameters to where no camera is, from which no gradient leads back
         bad = (cameras.usable <= 0).flatten().nonzero()
         found = unusable(camera, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
@@ -190,7 +192,8 @@ def kept_cameras(memo: Kept, model: type[CameraLike], intrinsics: Tensor, distor
                 if not same(now, (then, mark)):
                     break
                 continue
-            if now.ndim != then.ndim and now.numel() == then.numel():  # one camera has them as (n,) and as (1, n)
+            # a single camera comes as (n,) from warps, as (1, n) from `per_row`
+            if now.ndim != then.ndim and now.numel() == then.numel():
                 then = then[None] if now.ndim > then.ndim else then[0]
             if now.dtype != then.dtype or now.device != then.device or not torch.equal(now, then):
                 break
@@ -199,13 +202,16 @@ def kept_cameras(memo: Kept, model: type[CameraLike], intrinsics: Tensor, distor
     return memo.renew(lambda: CameraRows(model, intrinsics, distortion))
 
 
-def per_row(parameters: Tensor, lead: torch.Size, rows: Tensor) -> Tensor:
-    """Return parameters (*B, n) as (C, n), in the dtype of the rows (C, N, size)."""
-    if parameters.dtype != rows.dtype:
-        parameters = parameters.to(rows.dtype)
-    if not lead:
-        return parameters.unsqueeze(0)
-    count = parameters.shape[-1]
-    if parameters.shape == (rows.shape[0], count):
-        return parameters
-    return parameters.expand(*lead, count).reshape(rows.shape[0], count)
+def per_row(tensors: Sequence[Tensor], lead: torch.Size, rows: Tensor) -> list[Tensor]:
+    """Return tensors (*B, n) as (C, n), in the dtype of the rows (C, N, size)."""
+    made = []
+    for tensor in tensors:
+        count = tensor.shape[-1]
+        if tensor.dtype != rows.dtype:
+            tensor = tensor.to(rows.dtype)
+        if not lead:
+            tensor = tensor.unsqueeze(0)
+        elif tensor.shape != (rows.shape[0], count):
+            tensor = tensor.expand(*lead, count).reshape(rows.shape[0], count)
+        made.append(tensor)
+    return made

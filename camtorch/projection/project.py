@@ -85,4 +85,4 @@ def _keeping(native: Native, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tens
     return *native_calls.project(native, points), (points,)
 
 
-PROJECT = Direction(_formula, native_calls.project, _keeping, native_calls.project_vjp, "points", 3)
+PROJECT = Direction(_formula, native_calls.project, _keeping, native_calls.project_vjp, "points", 3, 2)

@@ -149,7 +149,7 @@ class Direction(NamedTuple):
     """One direction of cameras (C,) of a model, for rows (C, N, size): as torch records it, and in native code."""
 
     formula: Callable[..., tuple[Tensor, Tensor]]
-    """The formula: model, rows, intrinsics (C, 4), distortion (C, n), cameras, order to planes (size, C, N), valid.
+    """The formula: model, rows, intrinsics (C, 4), distortion (C, n), cameras, order to planes (size_out, C, N), valid.
 
     `cameras` are those of the parameters, if values may be read; derivatives up to `order` must be exact.
     """
@@ -161,6 +161,7 @@ class Direction(NamedTuple):
     """The native cotangents of rows and of the numbers of the cameras."""
     name: str  # the rows' name in messages
     size: int
+    size_out: int
 
 
 class Traced(NamedTuple):

@@ -192,7 +192,7 @@ def _keeping(native: Native, pixels: Tensor) -> tuple[Tensor, Tensor, tuple[Tens
     return rays, valid, (valid.clone(), present(solution, "the solution"))
 
 
-UNPROJECT = Direction(_formula, native_calls.unproject, _keeping, native_calls.unproject_vjp, "pixels", 2)
+UNPROJECT = Direction(_formula, native_calls.unproject, _keeping, native_calls.unproject_vjp, "pixels", 2, 3)
 
 
 def _search_recorded(domain: Domain, target: Planes2, found: Found) -> Found:

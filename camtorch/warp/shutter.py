@@ -238,6 +238,8 @@ class ShutterWarp(MirrorWarp):
 class InMotion:
     """A camera behind a rolling shutter, as a warp uses it: rays are those of the middle of the readout."""
 
+    has_native_form = False
+
     def __init__(self, camera: Camera, shutter: RollingShutter):
         self.camera = camera
         self.shutter = shutter
