@@ -16,12 +16,12 @@ from camtorch.cameras.operators import opaque
 from camtorch.evaluate.door import in_transform, keeps_graph
 from camtorch.evaluate.tensors import are_known, are_plain, is_unknown
 from camtorch.native.sampler import maker
-from camtorch.native.structs import STEP
 from camtorch.optics.radial_inverse import WITHOUT_FLOAT64
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
-from camtorch.warp.grid import Lattice, Sampling, coarse, straight_lattice
+from camtorch.warp.grid import coarse
+from camtorch.warp.lattice import Lattice, PixelPositions, straight_lattice
 from camtorch.warp.moving import placed
 from camtorch.warp.panorama import lengths
 from camtorch.warp.plan import Route
@@ -214,7 +214,7 @@ class AffineWarp(MirrorWarp):
     def tensors(self) -> list[Tensor]:
         return [self.matrix]
 
-    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
+    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> PixelPositions | Lattice:
         width = self.target.size_for("Warp")[1]
         back = inverted(self.matrix.reshape(-1, 2, 3))
         side = back.new_tensor(self.source.size_for("Warp")[::-1])[:, None]
@@ -229,9 +229,9 @@ class AffineWarp(MirrorWarp):
         grid = (a * u + b * v[:, None] + c).movedim(1, -1).to(dtype)
         mapped = torch.ones_like(grid[..., 0], dtype=torch.bool)
         if not self.antialias:
-            return Sampling(grid, mapped, None)
+            return PixelPositions(grid, mapped, None)
         scale = (back[:, :, :2] * side / 2).abs().sum(-1).amax(-1)
-        return Sampling(grid, mapped, scale.to(dtype)[:, None, None].expand(mapped.shape).contiguous())
+        return PixelPositions(grid, mapped, scale.to(dtype)[:, None, None].expand(mapped.shape).contiguous())
 
     def move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         pixels = as_values(pixels, "pixels", "Warp", self.matrix.device)
@@ -282,14 +282,10 @@ def _halved(scale: float) -> int:
     return min(max(math.ceil(math.log2(max(scale / SHRINKS, 0.5))), 0), _MOST)
 
 
-def _halvings(where: Sampling | Lattice, source: Camera) -> list[int]:
+def _halvings(where: PixelPositions | Lattice, source: Camera) -> list[int]:
     """Return for every camera how often to halve its image, measured at the same target pixels on all routes."""
-    first, step = coarse(where.size if isinstance(where, Lattice) else where.grid.shape[1:3])
-    if isinstance(where, Lattice) and step >= STEP:
-        planes = where.nodes[..., 2:-3, 2:-3]  # the nodes on the target's pixels
-        planes = planes[..., first // STEP :: step // STEP, first // STEP :: step // STEP]
-    else:
-        planes = where.pixels.grid.detach().movedim(-1, 1)[..., first::step, first::step]
+    first, step = coarse(where.size)
+    planes = where.every(first, step)
     seen = (planes.abs() <= 1).all(1)
     height, width = source.size_for("Warp")
     grid, planes = planes, planes * planes.new_tensor([width / 2, height / 2])[:, None, None]

@@ -41,19 +41,22 @@ class Seam(NamedTuple):
         images = torch.cat(rows, -2) if len(rows) > 1 else images
         return torch.cat((images[..., -left:], images, images[..., :right]), -1)
 
-    def before(self, camera: Camera) -> Camera:
-        """Return the camera of the extended images."""
-        left, right, top, bottom = self.rims
-        height, width = camera.size_for("Warp")
-        intrinsics = camera.intrinsics + camera.intrinsics.new_tensor([0.0, 0.0, left, top])
-        size = height + top + bottom, width + left + right
-        return remade(camera, intrinsics=intrinsics, distortion=camera.distortion, image_size=size)
-
     def on_image(self, grid: Tensor, size: tuple[int, int]) -> Tensor:
         """Return positions (..., 2) on the extended images as positions on the images of a size."""
         (height, width), (left, right, top, bottom) = size, self.rims
         scale = grid.new_tensor([(left + width + right) / width, (top + height + bottom) / height])
         return grid * scale + grid.new_tensor([(right - left) / width, (bottom - top) / height])
+
+
+def with_seam(camera: Camera, seam: Seam | None) -> Camera:
+    """Return the camera of images that a seam extends, or the same one without a seam."""
+    if seam is None:
+        return camera
+    left, right, top, bottom = seam.rims
+    height, width = camera.size_for("Warp")
+    intrinsics = camera.intrinsics + camera.intrinsics.new_tensor([0.0, 0.0, left, top])
+    size = height + top + bottom, width + left + right
+    return remade(camera, intrinsics=intrinsics, distortion=camera.distortion, image_size=size)
 
 
 def seam_of(camera: Camera) -> Seam | None:

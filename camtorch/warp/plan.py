@@ -9,7 +9,7 @@ an operator, or by `locate` in `grid.py`, which chooses between a lattice and ex
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from functools import partial
 from typing import Any, ClassVar, Literal
@@ -38,9 +38,10 @@ from camtorch.native.sampler import Call, maker
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
 from camtorch.warp import compiled
-from camtorch.warp.grid import Lattice, Sampling, local_scale, locate
+from camtorch.warp.grid import local_scale, locate
+from camtorch.warp.lattice import Lattice, PixelPositions
 from camtorch.warp.moving import moved_pixels
-from camtorch.warp.panorama import Seam, seam_of
+from camtorch.warp.panorama import Seam, seam_of, with_seam
 from camtorch.warp.sampling import (
     PADDINGS,
     Mode,
@@ -71,19 +72,18 @@ def _part(held: str, name: str) -> Any:
     return property(part)
 
 
-class Positions:
+class KeptPositions:
     """The positions of a warp's pixels while its cameras stay, or once and for all, and calls that sample there."""
 
-    def __init__(self, pinned: Sampling | Lattice | None = None, padding: str = "zeros"):
-        """Keep positions by the padding that they serve; `pinned` ones stay if the cameras change."""
+    def __init__(self, pinned: PixelPositions | Lattice | None = None, paddings: Sequence[PaddingMode] = ()):
+        """Keep positions by the padding that they serve; `pinned` ones, of these `paddings`, stay if cameras change."""
         self.is_pinned = pinned is not None
         self.calls: dict[tuple[object, ...], Call] = {}
-        self._found: dict[str, Sampling | Lattice] = {} if pinned is None else {padding: pinned}
-        self._exact = pinned if isinstance(pinned, Sampling) else None
+        self._found: dict[str, PixelPositions | Lattice] = {} if pinned is None else dict.fromkeys(paddings, pinned)
 
-    def serving(self, padding: str, compute: Callable[[], Sampling | Lattice]) -> Sampling | Lattice:
-        """Return `compute()` without a graph, or what is kept; pinned positions that are exact serve all paddings."""
-        found = self._found.get(padding) if self._exact is None else self._exact
+    def serving(self, padding: str, compute: Callable[[], PixelPositions | Lattice]) -> PixelPositions | Lattice:
+        """Return `compute()` without a graph, or what is kept for a padding."""
+        found = self._found.get(padding)
         if found is None:
             if in_transform():  # a transform's tensors die with it
                 return compute()
@@ -91,7 +91,7 @@ class Positions:
                 found = self._found[padding] = compute()
         return found
 
-    def keep(self, call: Call, form: tuple[object, ...], where: Sampling | Lattice) -> None:
+    def keep(self, call: Call, form: tuple[object, ...], where: PixelPositions | Lattice) -> None:
         """Keep the call for images of a form if its positions are kept."""
         if any(where is each for each in self._found.values()):
             if len(self.calls) >= _MOST_CALLS:
@@ -156,7 +156,7 @@ class CameraPair(GeometryModule):
     @property
     def is_pinned(self) -> bool:
         """Whether positions stay whatever becomes of the cameras."""
-        known: Positions | None = self._kept.result
+        known: KeptPositions | None = self._kept.result
         return known is not None and known.is_pinned
 
     @property
@@ -209,13 +209,13 @@ class CameraPair(GeometryModule):
     @property
     def sampled(self) -> Camera:
         """The source as the camera of the images that `seam` lengthens."""
-        source = self._ends[0]
-        seam = self.seam
-        return source if seam is None else seam.before(source)
+        return with_seam(self._ends[0], self.seam)
 
-    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
+    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> PixelPositions | Lattice:
         """Return positions of some rows of the target, which serve a padding, within a tolerance."""
-        return locate(self.sampled, self._ends[1], self.rotation, tolerance, self.antialias, rows, padding)
+        source, target = self._ends
+        sampled = with_seam(source, self.seam)
+        return locate(sampled, target, self.rotation, tolerance, self.antialias, rows, padding)
 
     def move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         """Return pixels of the source on the target's image, or back, and whether there is one; see `moved_pixels`."""
@@ -256,7 +256,7 @@ class CameraPair(GeometryModule):
 
     def ready(self, images: object, mode: str | None, padding: str | None) -> Call | None:
         """Return the call that an earlier one has left for images of this form, if nothing has changed since."""
-        known: Positions | None = self._kept.result
+        known: KeptPositions | None = self._kept.result
         if known is None or not known.calls or not isinstance(images, Tensor):
             return None
         mode, padding = self.mode if mode is None else mode, self.padding_mode if padding is None else padding
@@ -287,7 +287,7 @@ class CameraPair(GeometryModule):
                 with torch.no_grad():
                     render(images, where, *sampler, kept, result[:, :, rows])
             return result
-        known: Positions | None = self._kept.result
+        known: KeptPositions | None = self._kept.result
         where = self.positions(route, sampler.padding_mode)
         call = prepared(images, where, sampler)
         if call is None:
@@ -303,7 +303,7 @@ class CameraPair(GeometryModule):
         seam = self.seam
         return images if seam is None else laid_as(images, seam.around(images))
 
-    def positions(self, route: Route, padding: PaddingMode = "zeros") -> Sampling | Lattice:
+    def positions(self, route: Route, padding: PaddingMode = "zeros") -> PixelPositions | Lattice:
         """Return the positions at which target pixels sample the source's image: kept ones unless they have a graph."""
         is_traced, reach, tolerance = in_jit_trace(), self._reach(padding), self.tolerance
         if route == "graph":
@@ -321,15 +321,15 @@ class CameraPair(GeometryModule):
             where = self._positions().serving(reach if tolerance else "zeros", compute)
             return where.pixels if is_traced else where  # constants of the trace
 
-    def _positions(self) -> Positions:
-        known: Positions = self._kept.result
-        return known if known is not None and known.is_pinned else self._kept(self.tensors, self.form, Positions)
+    def _positions(self) -> KeptPositions:
+        known: KeptPositions = self._kept.result
+        return known if known is not None and known.is_pinned else self._kept(self.tensors, self.form, KeptPositions)
 
-    def by_pixel(self) -> Sampling:
+    def by_pixel(self) -> PixelPositions:
         """Return the positions of all pixels, one by one."""
         return self.positions(self.route()).pixels
 
-    def computed(self, padding: PaddingMode, tolerance: float) -> Sampling | Lattice:
+    def computed(self, padding: PaddingMode, tolerance: float) -> PixelPositions | Lattice:
         """Return the positions of all pixels, without a graph, which serve a padding."""
         if tolerance:
             if not self.antialias and (host := self.host) is not None:
@@ -337,7 +337,7 @@ class CameraPair(GeometryModule):
             if self.is_called():
                 planes, mapped = compiled.positions(self.sampled, self.target, self.rotation, tolerance, padding)
                 grid = planes.movedim(1, -1)
-                return Sampling(grid, mapped, local_scale(grid, mapped, self.sampled) if self.antialias else None)
+                return PixelPositions(grid, mapped, local_scale(grid, mapped, self.sampled) if self.antialias else None)
         return self.locate(range(self.target.size_for("Warp")[0]), padding, tolerance)
 
     def strip_positions(self, padding: PaddingMode = "zeros", count: int | None = None) -> Iterator[tuple[slice, Any]]:
@@ -359,7 +359,7 @@ class CameraPair(GeometryModule):
                 part, valid = render(images, where, *sampler, kept), self.on_image(where)
             yield rows, part, valid
 
-    def on_image(self, where: Sampling | Lattice) -> Tensor:
+    def on_image(self, where: PixelPositions | Lattice) -> Tensor:
         """Whether the source maps pixels onto its image, (B or 1, 1, h, W')."""
         grid, source = where.pixels.grid.detach(), self.sampled
         pixels = (grid + 1) * grid.new_tensor(source.size_for("Warp")[::-1]) / 2 - 0.5
@@ -370,13 +370,13 @@ class CameraPair(GeometryModule):
         # torch.compile knows no max with a key
         return PADDINGS[max(PADDINGS.index(self.padding_mode), PADDINGS.index(padding))]
 
-    def _constant(self, padding: PaddingMode) -> Sampling | Lattice | None:
+    def _constant(self, padding: PaddingMode) -> PixelPositions | Lattice | None:
         """Return the positions as a constant of an exported program; None if they depend on its inputs."""
         if not self.is_pinned and not is_constant(self):
             return None
         with set_aside() if self.is_pinned else with_values(self):
 
-            def own() -> Sampling:
+            def own() -> PixelPositions:
                 where = self.positions("kept", padding).pixels
                 grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
                 return where._replace(grid=grid, mapped=mapped)

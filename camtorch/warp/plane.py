@@ -14,7 +14,8 @@ from camtorch.evaluate.tensors import as_own, known_false, values_of
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, turn
 from camtorch.values.arguments import Numbers, as_batch, as_coordinates, as_number, as_real, shown
-from camtorch.warp.grid import Sampling, pixels_of_rows, scaled_rows, to_positions
+from camtorch.warp.grid import pixels_of_rows, scaled_rows, to_positions
+from camtorch.warp.lattice import PixelPositions
 from camtorch.warp.moving import placed
 from camtorch.warp.panorama import off_poles
 from camtorch.warp.reproject import beside, check_pose
@@ -110,9 +111,9 @@ class PlaneWarp(Warp):
         pose = self.extrinsics.rotation, self.extrinsics.translation
         return [*self.source.tensors, *self.target.tensors, *pose, self.normal, self.distance]
 
-    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
+    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> PixelPositions:
         if not self.antialias:
-            return Sampling(*self._of_rows(rows), None)
+            return PixelPositions(*self._of_rows(rows), None)
         return scaled_rows(self.sampled, rows, self.target.size_for("Warp")[0], self._of_rows)
 
     def _of_rows(self, rows: range) -> tuple[Tensor, Tensor]:

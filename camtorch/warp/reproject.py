@@ -16,7 +16,8 @@ from camtorch.rays.depth import as_depth, depth_scale
 from camtorch.values.arguments import Numbers, as_batch, check_devices, shown
 from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import GeometryModule, typed_as
-from camtorch.warp.grid import Sampling, to_positions
+from camtorch.warp.grid import to_positions
+from camtorch.warp.lattice import PixelPositions
 from camtorch.warp.panorama import off_poles, seam_of
 from camtorch.warp.sampling import Fill, Mode, PaddingMode, as_options, render
 from camtorch.warp.warp import as_sized
@@ -114,7 +115,7 @@ class Reproject(GeometryModule):
             images, seen = seam.around(images), seen + seen.new_tensor(seam.rims[::2])
         positions = to_positions(seen.flatten(1, 2), valid.flatten(1, 2), (images.shape[-2], images.shape[-1]))
         valid = valid & (positions.detach().abs() <= 1).all(-1).view(valid.shape)
-        where = Sampling(positions, valid.flatten(1, 2), None)
+        where = PixelPositions(positions, valid.flatten(1, 2), None)
         result = render(images, where, mode, self.padding_mode, self.fill)
         valid = valid.expand(max(rows, len(result)), *valid.shape[1:])[:, None]
         if steps == 1:

@@ -20,7 +20,7 @@ from camtorch.projection.evaluation import compiled_of
 from camtorch.projection.native_calls import Lattices, NativeMove, run_and_follow
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
-from camtorch.warp.grid import FEWEST, MOST_KEPT, coarse, kept_probes
+from camtorch.warp.grid import FEWEST, MOST_KEPT, coarse, probes
 from camtorch.warp.panorama import goes_round
 from camtorch.warp.plan import CameraPair
 from camtorch.warp.sampling import PADDINGS, SHRINKS, SURELY, Options, Sampler
@@ -168,8 +168,8 @@ class SampleCall:
         samplers = [how for how in hows if isinstance(how, Sampler)]
         padding = PADDINGS[max((PADDINGS.index(how.padding_mode) for how in samplers), default=0)]
         with torch.inference_mode(False):
-            probes = kept_probes(range(sizes[1][0]), sizes[1][1], dtype)
-            self._lattices = Lattices(probes, sizes[1], sizes[0], tolerance, padding, count)
+            nodes = probes(range(sizes[1][0]), sizes[1][1], dtype)
+            self._lattices = Lattices(nodes, sizes[1], sizes[0], tolerance, padding, count)
         images, moving = len(samplers), sum(how in ("pixels", "boxes") for how in hows)
         self._jobs, pixels = (structs.Job * images)(), (structs.Move * moving)()
         vectors = (structs.Turned * (len(hows) - images - moving))()

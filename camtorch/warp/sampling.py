@@ -18,7 +18,7 @@ from camtorch.native.library import native_available, warn_if_missing
 from camtorch.values.arguments import as_flag, as_number, one_of, shown
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, wide_dtype, widen
 from camtorch.values.threads import thread_count
-from camtorch.warp.grid import Lattice, Sampling
+from camtorch.warp.lattice import Lattice, PixelPositions
 
 Mode: TypeAlias = sampler.Mode
 PaddingMode = Literal["zeros", "border", "reflection"]
@@ -44,7 +44,7 @@ class Sampler(NamedTuple):
 
 def render(
     images: Tensor,
-    where: Sampling | Lattice,
+    where: PixelPositions | Lattice,
     mode: Mode,
     padding_mode: PaddingMode,
     fill: tuple[float, ...],
@@ -69,14 +69,15 @@ def laid_as(images: Tensor, result: Tensor) -> Tensor:
     return result.contiguous(memory_format=torch.channels_last)
 
 
-def prepared(images: Tensor, where: Sampling | Lattice, how: Sampler, out: Tensor | None = None) -> sampler.Call | None:
+def prepared(
+    images: Tensor, where: PixelPositions | Lattice, how: Sampler, out: Tensor | None = None
+) -> sampler.Call | None:
     """Return the call of native code for images (B or 1, C, H, W) of this form, of which results lie like `out`.
 
     None with a graph, a transform, another device or dtype, or antialiasing.
     """
     mode, padding_mode, fill = how
-    where = where.pixels if isinstance(where, Lattice) and where.smooth else where
-    positions = where.nodes if isinstance(where, Lattice) else where.grid
+    positions = where.like
     if not is_eager(images, positions):
         return None
     if not (native_available() and sampler.takes(images.dtype, mode)):
@@ -84,24 +85,17 @@ def prepared(images: Tensor, where: Sampling | Lattice, how: Sampler, out: Tenso
         return None
     if images.requires_grad or (positions.requires_grad and images.dtype.is_floating_point):
         return None
+    if positions.dtype not in (torch.float32, torch.float64) or (where.scale is not None and mode != "nearest"):
+        return None
     fill = fill * images.shape[1] if len(fill) == 1 else fill
     cameras = positions.shape[0]
     images = images if cameras == 1 else images.expand(cameras, -1, -1, -1)
-    if isinstance(where, Lattice):
-        at = where.single
-        on = {"nodes": at.nodes, "cells": at.cells, "exact": at.exact}
-        return sampler.Call(images, where.size, mode, padding_mode, fill, **on, out=out)
-    if positions.dtype not in (torch.float32, torch.float64) or (where.scale is not None and mode != "nearest"):
-        return None
-    # in "zeros" positions far outside say that there is none
-    mapped = None if padding_mode == "zeros" else where.mapped
-    size = positions.shape[1], positions.shape[2]
-    return sampler.Call(images, size, mode, padding_mode, fill, grid=positions.detach(), mapped=mapped, out=out)
+    return sampler.Call(images, where.size, mode, padding_mode, fill, **where.for_native(padding_mode), out=out)
 
 
 def by_torch(
     images: Tensor,
-    where: Sampling | Lattice,
+    where: PixelPositions | Lattice,
     how: Sampler,
     kept: dict[int, Pyramid] | None = None,
     out: Tensor | None = None,
@@ -118,7 +112,7 @@ def by_torch(
     return laid_as(images, result) if out is None else out.copy_(result)
 
 
-def _by_torch(images: Tensor, where: Sampling, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
+def _by_torch(images: Tensor, where: PixelPositions, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
     count, dtype = images.shape[0], images.dtype
     wide = dtype == wide_dtype(dtype)
     if how.mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:
@@ -174,7 +168,7 @@ def _levels(kept: dict[int, Pyramid] | None, i: int, images: Tensor) -> Pyramid:
     return Pyramid(images) if kept is None else kept.setdefault(i, Pyramid(images))
 
 
-def _render_tiles(result: Tensor, levels: Pyramid, where: Sampling, how: Sampler) -> None:
+def _render_tiles(result: Tensor, levels: Pyramid, where: PixelPositions, how: Sampler) -> None:
     """Render an image in tiles of the target, each from a copy of the part that it reads."""
     for top in range(0, result.shape[2], _TILE):
         for left in range(0, result.shape[3], _TILE):
@@ -184,7 +178,7 @@ def _render_tiles(result: Tensor, levels: Pyramid, where: Sampling, how: Sampler
             result[:, :, down, across] = narrow(_render(images, grid, here, levels, how), result.dtype)
 
 
-def _read(images: Tensor, where: Sampling, how: Sampler) -> tuple[Tensor, Tensor]:
+def _read(images: Tensor, where: PixelPositions, how: Sampler) -> tuple[Tensor, Tensor]:
     """Return the part of the images that is read, as of `widen`, and the positions on it; padding stays as it is."""
     reach, slices, axes = sampler.MODES[how.mode].reach, [], []
     sides, planes = images.shape[:-3:-1], where.grid.unbind(-1)
@@ -209,7 +203,7 @@ def _read(images: Tensor, where: Sampling, how: Sampler) -> tuple[Tensor, Tensor
     return widen(images[:, :, slices[1], slices[0]]), torch.stack(axes, -1)
 
 
-def _render(images: Tensor, grid: Tensor, where: Sampling, levels: Pyramid, how: Sampler) -> Tensor:
+def _render(images: Tensor, grid: Tensor, where: PixelPositions, levels: Pyramid, how: Sampler) -> Tensor:
     """Render images of a dtype to compute in, or a part of them, at positions `grid` on it, filled and antialiased."""
     mode, padding_mode, fill = how
     minifies = where.scale is not None
@@ -283,7 +277,7 @@ def _grid_sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: Padding
 
 def _sample(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
     """Sample on a CPU with work for every thread; grid_sample gives one thread to each image."""
-    where = Sampling(grid[:1] if grid.stride(0) == 0 else grid, images.new_empty(0), None)
+    where = PixelPositions(grid[:1] if grid.stride(0) == 0 else grid, images.new_empty(0), None)
     call = prepared(images, where, Sampler(mode, padding_mode, (0.0,))) if padding_mode == "zeros" else None
     if call is not None:
         return call(images)

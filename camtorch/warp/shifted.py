@@ -11,7 +11,8 @@ from torch.nn.functional import max_pool2d
 
 from camtorch.cameras.camera import Camera
 from camtorch.rays.depth import as_depth, depth_scale
-from camtorch.warp.grid import Sampling, to_positions
+from camtorch.warp.grid import to_positions
+from camtorch.warp.lattice import PixelPositions
 from camtorch.warp.moving import placed
 from camtorch.warp.sampling import PaddingMode
 from camtorch.warp.warp import Warp
@@ -78,9 +79,9 @@ class ShiftedWarp(Warp):
         away = _length(rays * length[..., None] - self.shift.to(distance)[:, None, None])
         return torch.where(mapped & (length > 0), away, 0.0)[:, None]
 
-    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Sampling:
+    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> PixelPositions:
         seen, mapped = (t[:, rows.start : rows.stop] for t in self._surface())
-        return Sampling(to_positions(seen.clone(), mapped, self.source.size_for("Warp")), mapped, None)
+        return PixelPositions(to_positions(seen.clone(), mapped, self.source.size_for("Warp")), mapped, None)
 
     def move(self, pixels: Any, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         if back:

@@ -27,7 +27,7 @@ from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import typed_as
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
-from camtorch.warp.plan import CameraPair, Positions
+from camtorch.warp.plan import CameraPair, KeptPositions
 from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, Options, PaddingMode, Sampler, as_fill, as_options
 
 
@@ -232,11 +232,12 @@ class Warp(CameraPair):
         # the operator of a compiled graph keeps its own; what inference mode makes could not be used in a graph later
         if self.is_pinned or self.is_called() or torch.is_inference_mode_enabled():
             return self
-        if self.route() == "graph":
-            where = self.locate(range(self.target.size_for("Warp")[0]), self.padding_mode, 0.0)
-        else:
-            where = self.positions("kept")
-        self._kept.renew(lambda: Positions(where, self.padding_mode))
+        learns = self.route() == "graph"
+        every = range(self.target.size_for("Warp")[0])
+        where = self.locate(every, self.padding_mode, 0.0) if learns else self.positions("kept")
+        # a lattice serves one padding, and so do positions that were made of one on the CPU
+        is_exact = learns or (where.pixels is where and self.host is None)
+        self._kept.renew(lambda: KeptPositions(where, PADDINGS if is_exact else [self.padding_mode]))
         return self
 
     def transform_points(self, pixels: Numbers) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import camtorch as ct
 from camtorch.native.library import native_available
 from camtorch.warp import sampling
-from camtorch.warp.grid import Sampling
+from camtorch.warp.lattice import PixelPositions
 
 
 @pytest.mark.skipif(not native_available(), reason="autograd keeps more of the formula")
@@ -69,7 +69,7 @@ def test_parts_of_images_change_nothing(threads, count, dtype, monkeypatch):
     generator = torch.Generator().manual_seed(0)
     images = (255 * torch.rand(count, 3, 11, 13, generator=generator)).to(dtype)
     positions = 2.4 * torch.rand(count, 7, 5, 2, generator=generator) - 1.2
-    where = Sampling(positions, torch.ones(count, 7, 5, dtype=torch.bool), None)
+    where = PixelPositions(positions, torch.ones(count, 7, 5, dtype=torch.bool), None)
     for mode in ("bilinear", "nearest", "bicubic"):
         result = sampling.render(images, where, mode, "zeros", (0.0,))
         wide = images.double() if dtype == torch.float64 else images.float()

@@ -20,7 +20,7 @@ from camtorch.native.library import _find, library, native_available
 from camtorch.values.dtypes import widen
 from camtorch.warp import grid as positions
 from camtorch.warp import sampling
-from camtorch.warp.grid import Lattice, Sampling
+from camtorch.warp.lattice import Lattice, PixelPositions
 from camtorch.warp.sampling import MODES, PADDINGS
 
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
@@ -124,8 +124,7 @@ def both(images, where, mode, padding, fill=(0.0,), span=None):
     with torch_alone(), counted() as calls:
         expected = sampling.render(images, where, mode, padding, fill)
     assert not calls
-    grid = where.pixels.grid if isinstance(where, Lattice) else where.grid
-    compare(result, expected, mode, between(grid, images.shape[-2:]), span or extent(images.dtype))
+    compare(result, expected, mode, between(where.pixels.grid, images.shape[-2:]), span or extent(images.dtype))
     return result
 
 
@@ -171,7 +170,7 @@ def fills(dtype, channels):
 @pytest.mark.parametrize("dtype", INTEGERS + FLOATS)
 def test_every_image_is_sampled_as_torch_does(dtype, mode, padding):
     count, source, target = 2, (23, 37), (13, 30)
-    where = Sampling(spots(count, target, source), torch.rand(count, *target, generator=generator(9)) < 0.9, None)
+    where = PixelPositions(spots(count, target, source), torch.rand(count, *target, generator=generator(9)) < 0.9, None)
     if padding == "zeros":
         where.grid[~where.mapped] = positions.OUTSIDE
     for i, (name, layout) in enumerate(LAYOUTS.items()):
@@ -199,7 +198,7 @@ def test_every_size_is_sampled_as_torch_does(dtype, mode):
     for i, source in enumerate(SIZES):
         for j, target in enumerate(SIZES):
             padding, channels = PADDINGS[(i + j) % 3], (1, 3, 4)[(i + j // 3) % 3]
-            where = Sampling(spots(1, target, source, i), torch.ones(1, *target, dtype=torch.bool), None)
+            where = PixelPositions(spots(1, target, source, i), torch.ones(1, *target, dtype=torch.bool), None)
             images = pixels(dtype, (2, channels, *source), j)
             both(hwc(images) if j % 2 else images, where, mode, padding)
 
@@ -224,7 +223,7 @@ def test_rows_that_read_rows_are_sampled_as_torch_does(dtype, mode, padding):
         grid = gentle(2, target, source, zoom, turn)
         if turn == 0.0:  # the rim, and pixels themselves
             grid = grid - grid[:, :1, :1] - (1 - 1 / torch.tensor(source[::-1], dtype=torch.float32))
-        where = Sampling(grid, torch.ones(2, *target, dtype=torch.bool), None)
+        where = PixelPositions(grid, torch.ones(2, *target, dtype=torch.bool), None)
         images = pixels(dtype, (2, (1, 3, 4)[i // 2 % 3], *source), i)
         both(hwc(images) if i % 2 else images, where, mode, padding, (1.0,))
 
@@ -236,7 +235,7 @@ def test_every_layout_of_a_grid(dtype):
     base = spots(3, target, source)
     mapped = torch.ones(3, *target, dtype=torch.bool)
     images = pixels(dtype, (3, 3, *source))
-    expected = both(images, Sampling(base, mapped, None), "bilinear", "zeros")
+    expected = both(images, PixelPositions(base, mapped, None), "bilinear", "zeros")
     layouts = {
         "planes": base.movedim(-1, 0).contiguous().movedim(0, -1),
         "cropped": torch.nn.functional.pad(base, (0, 3, 2, 9, 1, 1))[:, 1:-1, 2:-9, :2],
@@ -246,11 +245,11 @@ def test_every_layout_of_a_grid(dtype):
         "float64 planes": base.double().movedim(-1, 0).contiguous().movedim(0, -1),
     }
     for grid in layouts.values():
-        assert torch.equal(both(images, Sampling(grid, mapped, None), "bilinear", "zeros"), expected)
+        assert torch.equal(both(images, PixelPositions(grid, mapped, None), "bilinear", "zeros"), expected)
     for grid in [base[:1], *(part.expand(base.shape) for part in (base[:1], base[:, :1], base[:, :, :1]))]:
-        both(images, Sampling(grid, mapped[: len(grid)], None), "bilinear", "reflection")
-    one = both(images[:1], Sampling(base, mapped, None), "bilinear", "border")
-    assert torch.equal(one[1], both(images[:1], Sampling(base[1:2], mapped[:1], None), "bilinear", "border")[0])
+        both(images, PixelPositions(grid, mapped[: len(grid)], None), "bilinear", "reflection")
+    one = both(images[:1], PixelPositions(base, mapped, None), "bilinear", "border")
+    assert torch.equal(one[1], both(images[:1], PixelPositions(base[1:2], mapped[:1], None), "bilinear", "border")[0])
 
 
 @pytest.mark.usefixtures("each_variant")
@@ -266,7 +265,7 @@ def test_positions_that_are_far_or_no_numbers(dtype, mode, padding):
             grid[..., ::3, 0] = strange
             if both_axes:
                 grid[..., 1] = strange
-            where = Sampling(grid, torch.ones(1, *size, dtype=torch.bool), None)
+            where = PixelPositions(grid, torch.ones(1, *size, dtype=torch.bool), None)
             result = sampling.render(images, where, mode, padding, (1.0,))
             assert result.shape == (1, 3, *size)
             assert result.isfinite().all()
@@ -285,7 +284,7 @@ def test_wide_images(source):
     """Twenty thousand pixels along a side, where float32 holds a thousandth of one."""
     v, u = (torch.linspace(-1.001, 1.001, n) for n in ((11, 5000) if source[1] > source[0] else (5000, 11)))
     grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)[None]
-    where = Sampling(grid, torch.ones(grid.shape[:3], dtype=torch.bool), None)
+    where = PixelPositions(grid, torch.ones(grid.shape[:3], dtype=torch.bool), None)
     smooth = (torch.arange(math.prod(source)).view(1, 1, *source) / 400).sin().expand(1, 3, -1, -1)
     both(smooth.contiguous(), where, "bilinear", "zeros")
     both((100 + 100 * smooth).to(torch.uint8), where, "bilinear", "border")

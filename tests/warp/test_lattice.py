@@ -16,7 +16,7 @@ from camtorch.native import sampler
 from camtorch.native.library import native_available
 from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_QUINTIC
 from camtorch.warp import cells, grid
-from camtorch.warp.grid import Lattice
+from camtorch.warp.lattice import Lattice
 
 TOLERANCES = (0.1, 0.01)
 
@@ -28,7 +28,7 @@ def way(request, monkeypatch):
         pytest.skip("there is no compiled library")
     if request.param == "torch":
         monkeypatch.setattr(grid, "native_available", lambda: False)
-        monkeypatch.setattr(grid, "_move_back", lambda *_: None)
+        monkeypatch.setattr(grid.Between, "native", lambda _: None)
 
 
 def check(source, target, rotation):
@@ -88,11 +88,11 @@ def test_torch_doubts_the_cells_that_compiled_code_doubts(key, monkeypatch):
 
     for pair in ((camera, target), (target, camera), (camera, camera)):
         for padding, tolerance in (("zeros", 1e-3), ("border", 1e-3), ("reflection", 0.1)):
-            given = *pair, rotation, tolerance, range(240), padding
+            given = grid.Between(*pair, rotation), range(240), tolerance, padding
             compiled = grid.on_lattice(*given)
             with monkeypatch.context() as patch:
                 patch.setattr(grid, "native_available", lambda: False)
-                patch.setattr(grid, "_move_back", lambda *_: None)
+                patch.setattr(grid.Between, "native", lambda _: None)
                 patch.setattr(grid, "classify", both)
                 patch.setattr(grid, "are_smooth", lambda *_: False)
                 laid = grid.on_lattice(*given)
