@@ -16,7 +16,7 @@ import camtorch as ct
 from camtorch import augment as A  # noqa: N812
 from camtorch import losses, views
 from camtorch.poses.rotations import rotation_matrix
-from camtorch.warp.sampling import MODES, PADDINGS
+from camtorch.warp.options import MODES, PADDINGS
 
 SIZE = (48, 64)
 

@@ -21,8 +21,8 @@ from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import remade
 from camtorch.warp.affine import AffineWarp, MirrorWarp, after
 from camtorch.warp.boxes import corners_of, in_order
+from camtorch.warp.options import Mode, Options
 from camtorch.warp.panorama import seam_of
-from camtorch.warp.sampling import Mode, Options
 from camtorch.warp.shifted import ShiftedWarp
 from camtorch.warp.warp import Warp
 

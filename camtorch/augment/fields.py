@@ -22,8 +22,8 @@ from camtorch.poses.rotations import are_rotations, check_rotation, is_right, ro
 from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians, warn
 from camtorch.values.dtypes import widen
 from camtorch.warp import arrays
+from camtorch.warp.options import Options, Sampler
 from camtorch.warp.samples import Label
-from camtorch.warp.sampling import Options, Sampler
 
 Named = dict[str, tuple[str, Any]]
 """Maps a name to (kind, tensor or list of tensors)."""

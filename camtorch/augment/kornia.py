@@ -38,7 +38,7 @@ from camtorch.optics.radial_inverse import precise
 from camtorch.values.arguments import as_part, no_camera
 from camtorch.values.dtypes import narrow, widen
 from camtorch.warp.affine import AffineWarp, MirrorWarp
-from camtorch.warp.sampling import Mode
+from camtorch.warp.options import Mode
 from camtorch.warp.warp import Warp
 
 Flags: TypeAlias = dict[str, Any]

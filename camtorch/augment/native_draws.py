@@ -24,8 +24,8 @@ from camtorch.projection.rows import CameraRows, domain_for, single_native
 from camtorch.rays.lattices import defined_or
 from camtorch.values.arguments import present
 from camtorch.values.module import model_of, remade
+from camtorch.warp.options import Options
 from camtorch.warp.panorama import PANORAMAS
-from camtorch.warp.sampling import Options
 
 _SIZES = {"centre": 2, "distortion": structs.AMOUNTS, "place": 2}
 _KINDS = {"yaw": structs.YAW, "pitch": structs.PITCH, "roll": structs.ROLL, "zoom": structs.ZOOM, "fov": structs.WIDTH}

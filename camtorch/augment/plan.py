@@ -22,8 +22,8 @@ from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import thread_count
 from camtorch.warp.affine import MirrorWarp
 from camtorch.warp.boxes import along_edges, around, corners_of, in_order
+from camtorch.warp.options import Options, Sampler
 from camtorch.warp.samples import Label, MovedField, call_for, natives_of
-from camtorch.warp.sampling import Options, Sampler
 from camtorch.warp.warp import Warp
 
 _OUTLINES = "pixels", "boxes"

@@ -29,7 +29,7 @@ from camtorch.native.library import warn_if_missing
 from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_number, check_devices, no_camera
 from camtorch.values.module import GeometryModule
 from camtorch.values.threads import on_one_thread
-from camtorch.warp.sampling import Options, as_options
+from camtorch.warp.options import Options, as_options
 
 P = ParamSpec("P")
 R = TypeVar("R")

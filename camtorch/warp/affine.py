@@ -23,9 +23,10 @@ from camtorch.warp import compiled
 from camtorch.warp.grid import coarse
 from camtorch.warp.lattice import Lattice, PixelPositions, straight_lattice
 from camtorch.warp.moving import placed
+from camtorch.warp.options import PaddingMode, Sampler
 from camtorch.warp.panorama import lengths
 from camtorch.warp.plan import Route
-from camtorch.warp.sampling import SHRINKS, PaddingMode, Sampler, render
+from camtorch.warp.sampling import SHRINKS, render
 from camtorch.warp.warp import Warp
 
 _MOST = 8  # an image is halved this often at most

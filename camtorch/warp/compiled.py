@@ -20,7 +20,8 @@ from camtorch.evaluate.kept import Kept
 from camtorch.native.sampler import layout
 from camtorch.values.arguments import broadcast_shapes
 from camtorch.warp.grid import locate
-from camtorch.warp.sampling import Sampler, render
+from camtorch.warp.options import Sampler
+from camtorch.warp.sampling import render
 
 
 def _count(rotation: Tensor | None, *numbers: Tensor) -> int:

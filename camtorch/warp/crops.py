@@ -16,7 +16,8 @@ from camtorch.evaluate.kept import Kept
 from camtorch.values.arguments import Numbers, as_values
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.lattice import PixelPositions
-from camtorch.warp.sampling import Fill, Mode, PaddingMode, TolerantOptions, as_options, render
+from camtorch.warp.options import Fill, Mode, PaddingMode, TolerantOptions, as_options
+from camtorch.warp.sampling import render
 from camtorch.warp.warp import Warp, checked
 
 

@@ -16,7 +16,7 @@ from camtorch.models import UCM, Cylindrical, Equirectangular, Pinhole
 from camtorch.poses.rotations import as_rotation
 from camtorch.rays.lattices import around_ends, image_lattice
 from camtorch.values.arguments import as_fov, as_image_size, broadcast_shapes, check_devices, hinting, one_of, warn
-from camtorch.warp.sampling import TolerantOptions
+from camtorch.warp.options import TolerantOptions
 from camtorch.warp.warp import Warp, as_sized
 
 Projection = Literal["perspective", "stereographic", "cylindrical", "equirectangular"]

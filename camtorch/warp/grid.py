@@ -209,15 +209,14 @@ def on_lattice(cameras: Between, rows: range, tolerance: float, padding: str) ->
     has them on another device; for cameras that learn see `_learning`.
     """
     target = cameras.target
-    side = min(len(rows), target.size_for("Warp")[1])
-    if not is_eager(target.intrinsics) or math.ceil(side / STEP) < FEWEST:
+    size = len(rows), target.size_for("Warp")[1]
+    if not is_eager(target.intrinsics) or math.ceil(min(size) / STEP) < FEWEST:
         return None
-    if keeps_graph(*cameras.tensors):
-        return _learning(cameras, rows, tolerance, padding)
-    return _found(cameras, rows, tolerance, padding)
+    find = _learning if keeps_graph(*cameras.tensors) else _found
+    return find(cameras, rows.start, size, tolerance, padding)
 
 
-def _learning(cameras: Between, rows: range, tolerance: float, padding: str) -> Lattice | None:
+def _learning(cameras: Between, first: int, size: tuple[int, int], tolerance: float, padding: str) -> Lattice | None:
     """Return a lattice that is found without a graph, and of which nodes and exact cells are computed again with one.
 
     Cells that quintics do are `CELL_QUINTIC`, and more than a fifth exact ones are too many. None if derivatives may
@@ -229,18 +228,18 @@ def _learning(cameras: Between, rows: range, tolerance: float, padding: str) -> 
     if not is_eager(*cameras.tensors) or turns or any(map(_learns_by_parts, (source, target))):
         return None
     with torch.no_grad():  # a quarter: errors of positions are larger in derivatives than in images
-        found = _found(cameras, rows, tolerance / 4, padding, learns=True)
+        found = _found(cameras, first, size, tolerance / 4, padding, learns=True)
     if found is None:
         return None
     cells, shape = found.cells, found.nodes.shape[2:]
-    pixels = probes(rows, found.size[1], _like(cameras.target).dtype)[:, : shape.numel()]
+    pixels = probes(first, size, _like(target).dtype)[:, : shape.numel()]
     nodes = cameras.exact(pixels)[0][:, 0].movedim(-1, 1).unflatten(2, shape)
     if not nodes.requires_grad:
         cells.masked_fill_(cells == CELL_QUINTIC, CELL_TODO)
-    exact = _of_cells(cameras, rows.start, cells, cells >= 0)
+    exact = _of_cells(cameras, first, cells, cells >= 0)
     if nodes.requires_grad:
         prefer_quintics(nodes.detach(), cells, source.size_for("Warp"), tolerance)
-    return Lattice(nodes, cells, exact, found.size)
+    return Lattice(nodes, cells, exact, size)
 
 
 def _learns_by_parts(camera: Camera) -> bool:
@@ -258,13 +257,14 @@ def _has_parts(model: type[Camera], count: int) -> bool:
     return any(vars(type(part)).get("code") in (None, RADIUS_TABLE, SURFACE) for part in parts)
 
 
-def _found(cameras: Between, rows: range, tolerance: float, padding: str, learns: bool = False) -> Lattice | None:
+def _found(
+    cameras: Between, first: int, size: tuple[int, int], tolerance: float, padding: str, learns: bool = False
+) -> Lattice | None:
     """Return the lattice of `on_lattice` without a graph; if it `learns`, the one that `_learning` begins with."""
-    size = len(rows), cameras.target.size_for("Warp")[1]
     native = cameras.native()
     if native is None:
-        return _found_by_torch(cameras, rows.start, size, tolerance, padding, learns)
-    made = native.lattices(probes(rows, size[1], native.dtype), size, rows.start, tolerance, padding, learns)
+        return _found_by_torch(cameras, first, size, tolerance, padding, learns)
+    made = native.lattices(probes(first, size, native.dtype), size, first, tolerance, padding, learns)
     return None if made is None else Lattice(*made, size)
 
 
@@ -276,7 +276,7 @@ def _found_by_torch(
     # the library finds cubics for each cell; torch alone first looks one node further, whether quintics do everywhere
     looks_further = not (learns or native_available())
     shape = (n + 7, m + 7) if looks_further else (n + 5, m + 5)
-    pixels = probes(range(first, first + size[0]), size[1], _like(cameras.target).dtype, shape[0] - n)
+    pixels = probes(first, size, _like(cameras.target).dtype, shape[0] - n)
     positions, mapped = (t[:, 0] for t in cameras.exact(pixels))
     count = math.prod(shape)
     nodes = positions[:, :count].movedim(-1, 1).contiguous().unflatten(2, shape)
@@ -304,28 +304,29 @@ def coarse(size: tuple[int, ...]) -> tuple[int, int]:
     return (16, 32) if min(size) >= 64 else (0, STEP) if min(size) > STEP else (0, 1)
 
 
-def probes(rows: range, width: int, dtype: torch.dtype, more: int = 5) -> Tensor:
+def probes(first: int, size: tuple[int, int], dtype: torch.dtype, more: int = 5) -> Tensor:
     """Return the nodes of a lattice, and then the pixels at the rim of the target, (1, N, 2) on the CPU.
 
-    more: how many more nodes than cells there are along an axis. Those of small lattices are kept for the next one.
+    The target's part of this size begins with row `first`. Of small lattices they are kept for the next one.
+
+    more: how many more nodes than cells there are along an axis.
     """
-    nodes = (math.ceil(len(rows) / STEP) + more) * (math.ceil(width / STEP) + more)
-    return (_kept_probes if nodes <= MOST_KEPT else _new_probes)(rows, width, dtype, more)
+    nodes = (math.ceil(size[0] / STEP) + more) * (math.ceil(size[1] / STEP) + more)
+    return (_kept_probes if nodes <= MOST_KEPT else _new_probes)(first, size, dtype, more)
 
 
-def _new_probes(rows: range, width: int, dtype: torch.dtype, more: int) -> Tensor:
+def _new_probes(first: int, size: tuple[int, int], dtype: torch.dtype, more: int) -> Tensor:
     with torch.inference_mode(False):
-        down, across = (torch.arange(length, dtype=dtype, device="cpu") for length in (len(rows), width))
+        down, across = (torch.arange(length, dtype=dtype, device="cpu") for length in size)
         # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
         v, u = (
-            (torch.arange(math.ceil(side / STEP) + more, dtype=dtype, device="cpu") - more // 2) * STEP
-            for side in (len(rows), width)
+            (torch.arange(math.ceil(side / STEP) + more, dtype=dtype, device="cpu") - more // 2) * STEP for side in size
         )
-        nodes = torch.stack(torch.meshgrid(u, v + rows.start, indexing="xy"))
+        nodes = torch.stack(torch.meshgrid(u, v + first, indexing="xy"))
         # (2 (w + h), 2): the pixels of the first and the last row, and of the first and the last column
-        down += rows.start
-        sides = [(across, torch.full_like(across, end)) for end in (rows[0], rows[-1])]
-        sides += [(torch.full_like(down, end), down) for end in (0, width - 1)]
+        down += first
+        sides = [(across, torch.full_like(across, end)) for end in (first, first + size[0] - 1)]
+        sides += [(torch.full_like(down, end), down) for end in (0, size[1] - 1)]
         return torch.cat((nodes.flatten(1), torch.cat([torch.stack(pair, -1) for pair in sides]).mT), 1).mT[None]
 
 

@@ -41,19 +41,9 @@ from camtorch.warp import compiled
 from camtorch.warp.grid import local_scale, locate
 from camtorch.warp.lattice import Lattice, PixelPositions
 from camtorch.warp.moving import moved_pixels
+from camtorch.warp.options import PADDINGS, Mode, Options, PaddingMode, Sampler
 from camtorch.warp.panorama import Seam, seam_of, with_seam
-from camtorch.warp.sampling import (
-    PADDINGS,
-    Mode,
-    Options,
-    PaddingMode,
-    Pyramid,
-    Sampler,
-    by_torch,
-    laid_as,
-    prepared,
-    render,
-)
+from camtorch.warp.sampling import Pyramid, by_torch, laid_as, prepared, render
 
 Route = Literal["operator", "strips", "graph", "kept"]
 _MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept

@@ -17,9 +17,9 @@ from camtorch.values.arguments import Numbers, as_batch, as_coordinates, as_numb
 from camtorch.warp.grid import pixels_of_rows, scaled_rows, to_positions
 from camtorch.warp.lattice import PixelPositions
 from camtorch.warp.moving import placed
+from camtorch.warp.options import PaddingMode, WarpOptions
 from camtorch.warp.panorama import off_poles
 from camtorch.warp.reproject import beside, check_pose
-from camtorch.warp.sampling import PaddingMode, WarpOptions
 from camtorch.warp.views import pinhole
 from camtorch.warp.warp import Warp
 

@@ -18,8 +18,9 @@ from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.grid import to_positions
 from camtorch.warp.lattice import PixelPositions
+from camtorch.warp.options import Fill, Mode, PaddingMode, as_options
 from camtorch.warp.panorama import off_poles, seam_of
-from camtorch.warp.sampling import Fill, Mode, PaddingMode, as_options, render
+from camtorch.warp.sampling import render
 from camtorch.warp.warp import as_sized
 
 _SNAP = {torch.float32: 4e-3, torch.float64: 1e-8}  # px, within which rounding may have moved a pixel

@@ -21,9 +21,10 @@ from camtorch.projection.native_calls import Lattices, NativeMove, run_and_follo
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 from camtorch.warp.grid import FEWEST, MOST_KEPT, coarse, probes
+from camtorch.warp.options import PADDINGS, Options, Sampler
 from camtorch.warp.panorama import goes_round
 from camtorch.warp.plan import CameraPair
-from camtorch.warp.sampling import PADDINGS, SHRINKS, SURELY, Options, Sampler
+from camtorch.warp.sampling import SHRINKS, SURELY
 
 Label = Literal["pixels", "boxes", "rays", "columns", "pose", "rotation vectors"]
 """What moves beside images: pixels, boxes, directions and points of the camera frame, or columns of such in a matrix,
@@ -168,7 +169,7 @@ class SampleCall:
         samplers = [how for how in hows if isinstance(how, Sampler)]
         padding = PADDINGS[max((PADDINGS.index(how.padding_mode) for how in samplers), default=0)]
         with torch.inference_mode(False):
-            nodes = probes(range(sizes[1][0]), sizes[1][1], dtype)
+            nodes = probes(0, sizes[1], dtype)
             self._lattices = Lattices(nodes, sizes[1], sizes[0], tolerance, padding, count)
         images, moving = len(samplers), sum(how in ("pixels", "boxes") for how in hows)
         self._jobs, pixels = (structs.Job * images)(), (structs.Move * moving)()

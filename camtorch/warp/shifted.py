@@ -14,7 +14,7 @@ from camtorch.rays.depth import as_depth, depth_scale
 from camtorch.warp.grid import to_positions
 from camtorch.warp.lattice import PixelPositions
 from camtorch.warp.moving import placed
-from camtorch.warp.sampling import PaddingMode
+from camtorch.warp.options import PaddingMode
 from camtorch.warp.warp import Warp
 
 _STEPS = 12  # of the search along a ray

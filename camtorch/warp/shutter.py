@@ -26,7 +26,7 @@ from camtorch.values.arguments import (
 )
 from camtorch.values.module import GeometryModule
 from camtorch.warp.affine import MirrorWarp
-from camtorch.warp.sampling import TolerantOptions
+from camtorch.warp.options import TolerantOptions
 from camtorch.warp.warp import Warp
 
 Direction = Literal["down", "up", "right", "left"]

@@ -30,7 +30,7 @@ from camtorch.values.dtypes import check_averaged, narrow, widen
 from camtorch.values.module import GeometryModule, remade, typed_as
 from camtorch.warp.boxes import corners_of
 from camtorch.warp.crops import CropsWarp, flattened
-from camtorch.warp.sampling import Mode
+from camtorch.warp.options import Mode
 from camtorch.warp.warp import Warp, as_sized
 
 __all__ = ["FACES", "Views", "crop_place", "cube", "look_at", "ring"]

@@ -27,8 +27,8 @@ from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import typed_as
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
+from camtorch.warp.options import MODES, PADDINGS, Fill, Mode, Options, PaddingMode, Sampler, as_fill, as_options
 from camtorch.warp.plan import CameraPair, KeptPositions
-from camtorch.warp.sampling import MODES, PADDINGS, Fill, Mode, Options, PaddingMode, Sampler, as_fill, as_options
 
 
 def as_sized(camera: Camera, name: str, owner: str) -> Camera:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import camtorch as ct
 from camtorch.native.library import native_available
-from camtorch.warp import sampling
+from camtorch.warp import grid_sample, sampling
 from camtorch.warp.lattice import PixelPositions
 
 
@@ -65,7 +65,7 @@ def test_a_pixel_is_valid_alone_as_in_a_batch(key):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.uint8, torch.bool])
 def test_parts_of_images_change_nothing(threads, count, dtype, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    monkeypatch.setattr(sampling, "native_available", lambda: False)
+    monkeypatch.setattr(grid_sample, "native_available", lambda: False)
     generator = torch.Generator().manual_seed(0)
     images = (255 * torch.rand(count, 3, 11, 13, generator=generator)).to(dtype)
     positions = 2.4 * torch.rand(count, 7, 5, 2, generator=generator) - 1.2

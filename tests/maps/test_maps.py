@@ -16,7 +16,7 @@ import torch
 import camtorch as ct
 from camtorch.cli.main import main
 from camtorch.maps.formats import FORMATS
-from camtorch.warp.sampling import MODES, PADDINGS
+from camtorch.warp.options import MODES, PADDINGS
 
 NOTES = [356.0, 356.0, 647.3, 404.8], [-0.0514, -0.0002, -0.0026, 0.0002]
 

@@ -19,9 +19,9 @@ from camtorch.native import sampler
 from camtorch.native.library import _find, library, native_available
 from camtorch.values.dtypes import widen
 from camtorch.warp import grid as positions
-from camtorch.warp import sampling
+from camtorch.warp import grid_sample, sampling
 from camtorch.warp.lattice import Lattice, PixelPositions
-from camtorch.warp.sampling import MODES, PADDINGS
+from camtorch.warp.options import MODES, PADDINGS
 
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 INTEGERS = (torch.bool, torch.uint8, torch.int8, torch.uint16, torch.int16, torch.int32, torch.int64)
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.skipif(not native_available(), reason="the sampler is n
 @contextmanager
 def torch_alone():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sampling, "native_available", lambda: False)
+        patch.setattr(grid_sample, "native_available", lambda: False)
         yield
 
 

@@ -8,7 +8,7 @@ import torch
 from cameras import fisheye, pinhole, turn
 
 import camtorch as ct
-from camtorch.warp.sampling import MODES, PADDINGS
+from camtorch.warp.options import MODES, PADDINGS
 
 SIZE = (40, 50)
 OPTIONS = {"antialias": True}, {"fill": 3.0}, {"padding_mode": "border"}

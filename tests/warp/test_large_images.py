@@ -6,6 +6,7 @@ from cameras import fisheye, turn
 
 import camtorch as ct
 from camtorch.warp import plan, sampling
+from camtorch.warp.options import MODES, PADDINGS
 
 SIZE = (90, 120)
 
@@ -26,8 +27,8 @@ def images(dtype, count=1):
     ("mode", "padding_mode", "dtype"),
     [
         (mode, padding_mode, (torch.uint8, torch.float16, torch.uint16 if i else torch.int32)[(i + j) % 3])
-        for i, mode in enumerate(sampling.MODES)
-        for j, padding_mode in enumerate(sampling.PADDINGS)
+        for i, mode in enumerate(MODES)
+        for j, padding_mode in enumerate(PADDINGS)
     ],
 )
 def test_tiles_of_a_large_image_change_nothing(dtype, mode, padding_mode, monkeypatch):

@@ -10,7 +10,7 @@ import torch
 from cameras import slow_unless
 from pretended import tensors_of, try_cases
 
-from camtorch.warp.sampling import MODES, PADDINGS
+from camtorch.warp.options import MODES, PADDINGS
 
 REFUSED = {"BoxCrop", "Compose: size, shutter", "RandomMount, shift", "RandomShutter"}
 """Calls that torch.compile refuses."""
