@@ -244,6 +244,7 @@ def _learning(cameras: Between, first: int, size: tuple[int, int], tolerance: fl
 
 def _learns_by_parts(camera: Camera) -> bool:
     """Whether coefficients learn that may shape parts of the image, narrower than cells."""
+    camera = getattr(camera, "camera", camera)  # behind a rolling shutter
     members = cast("Iterable[Camera]", camera.cameras) if isinstance(camera, Mixed) else (camera,)
     models: list[Any] = [(type(member), member.distortion) for member in members]
     return any(k.requires_grad and _has_parts(model, k.shape[-1]) for model, k in models)

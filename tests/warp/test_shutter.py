@@ -143,6 +143,18 @@ def test_a_scene_that_overtakes_the_rows_is_invalid_and_finite():
     assert torch.isfinite(rates.grad).all()
 
 
+def test_a_lattice_has_the_derivatives_of_a_learning_camera_behind_a_shutter():
+    v, u = torch.meshgrid(torch.arange(240.0), torch.arange(320.0), indexing="ij")
+    image = (torch.sin(u / 15) * torch.cos(v / 14))[None, None].double()
+    found = []
+    for tolerance in (1e-3, 0.0):
+        camera = fisheye().requires_grad_(True)
+        warp = ct.ShutterWarp(camera, fisheye(), shutter=shutter(), tolerance=tolerance)
+        warp(image).square().sum().backward()
+        found.append(torch.cat([number.grad for number in camera.parameters()]))
+    torch.testing.assert_close(*found, rtol=1e-3, atol=1e-5 * float(found[1].abs().max()))
+
+
 def test_states_of_0_3_load():
     made = shutter()
     state = made.state_dict()
