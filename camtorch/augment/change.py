@@ -153,7 +153,7 @@ class Part:
         if first is None:
             return replace(second, camera=self.camera)
         if not isinstance(last, LazyWarp) and last.keeps_lens:
-            return self.with_warps(last.follow)
+            return self.with_warps(lambda warp: last.between(warp.source, warp.target, warp.rotation, **last.options))
         turned, rotation = first.rotation, last.rotation  # (3, 3) or (B, 3, 3): the first turn, then the second
         if turned is not None and rotation is not None:
             dtype = torch.promote_types(turned.dtype, rotation.dtype)

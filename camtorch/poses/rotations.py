@@ -159,6 +159,11 @@ def turn(rotation: Tensor | None, rays: Tensor, name: str) -> Tensor:
     return restore(rotate_planes(rotation, rows.unbind(-1), rows))
 
 
+def transposed(rotation: Tensor | None) -> Tensor | None:
+    """Return the rotation back, (*B, 3, 3), or None for none."""
+    return None if rotation is None else rotation.mT
+
+
 def mount_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     """Return rotations (*B, 3, 3) of a camera that turns right, then up, then leans right: `ray_after = R ray_before`.
 

@@ -17,6 +17,7 @@ from camtorch.evaluate.door import in_transform, keeps_graph
 from camtorch.evaluate.tensors import are_known, are_plain, is_unknown
 from camtorch.native.sampler import maker
 from camtorch.optics.radial_inverse import WITHOUT_FLOAT64
+from camtorch.poses.rotations import transposed
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
@@ -155,7 +156,7 @@ class MirrorWarp(Warp):
         return maker(images, count, size)()
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
-        return MirrorWarp(source, target, rotation, **options)
+        return type(self)(source, target, rotation=rotation, **{**self.own_parts(), **options})
 
 
 class AffineWarp(MirrorWarp):
@@ -186,17 +187,14 @@ class AffineWarp(MirrorWarp):
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "map": self.map.detach() if isinstance(self.map, Tensor) else self.map}
 
-    def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
-        return AffineWarp(source, target, self.map, rotation, **options)
-
-    def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
-        own = self.map[index] if isinstance(self.map, Tensor) and self.map.ndim == 3 else self.map
-        return AffineWarp(source, target, own, rotation, **self.options)
+    def own_parts(self, index: list[int] | None = None) -> dict[str, Any]:
+        if index is not None and isinstance(self.map, Tensor) and self.map.ndim == 3:
+            return {"matrix": self.map[index]}
+        return {"matrix": self.map}
 
     def inverse(self) -> Warp:
         """Return the inverse edit. Pixels that this edit cut off stay lost."""
-        rotation = None if self.rotation is None else self.rotation.mT
-        return AffineWarp(self.target, self.source, inverted(self.map), rotation, **self.options)
+        return AffineWarp(self.target, self.source, inverted(self.map), transposed(self.rotation), **self.options)
 
     def pin(self) -> Warp:
         """Return this warp: pure copies need no sampling positions, others keep them from the first call."""

@@ -35,6 +35,7 @@ from camtorch.evaluate.export import with_values
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import is_unknown
 from camtorch.native.sampler import Call, maker
+from camtorch.poses.rotations import transposed
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
 from camtorch.warp import compiled
@@ -93,7 +94,7 @@ class CameraPair(GeometryModule):
     """The state of a `Warp`: source, target, rotation and options; and where target pixels lie."""
 
     is_an_operator: ClassVar[bool] = True  # compiled graphs may call it as one, as cameras and rotation are all of it
-    keeps_lens: ClassVar[bool] = False  # True: it can follow another warp, as one warp that `follow` returns
+    keeps_lens: ClassVar[bool] = False  # True: after another warp both are one, `between` the cameras of that
     batch_shape: torch.Size
     padding_mode: PaddingMode
     _tolerance: float | None
@@ -124,7 +125,7 @@ class CameraPair(GeometryModule):
 
     def __dir__(self) -> list[str]:
         """Return the names that users call, without those by which packages and other kinds of warps ask this one."""
-        inside = {*vars(CameraPair), *dir(GeometryModule), "rows_of", "follow"}
+        inside = {*vars(CameraPair), *dir(GeometryModule), "rows_of", "own_parts"}
         inside -= {"source", "target", "rotation", "tolerance", *dir(nn.Module)}
         names: list[str] = super().__dir__()  # type: ignore[no-untyped-call]
         return [name for name in names if name not in inside]
@@ -211,7 +212,7 @@ class CameraPair(GeometryModule):
         """Return pixels of the source on the target's image, or back, and whether there is one; see `moved_pixels`."""
         (source, target), rotation = self._ends, self.rotation
         if back:
-            source, target, rotation = target, source, None if rotation is None else rotation.mT
+            source, target, rotation = target, source, transposed(rotation)
         return moved_pixels(source, target, rotation, pixels, on_image)
 
     def route(self, images: Tensor | None = None) -> Route:

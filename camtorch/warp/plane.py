@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -145,9 +145,24 @@ class PlaneWarp(Warp):
 
     def inverse(self) -> PlaneWarp:
         """Return the warp from target to source, of the same plane. Pixels outside the image stay lost."""
-        back = Extrinsics.from_matrix(self._pose()).inverse()
-        options = {name: value for name, value in self.options.items() if name != "tolerance"}
-        return PlaneWarp(self.target, self.source, back, *self._plane_of_source(), **cast(WarpOptions, options))
+        normal, distance = self._plane_of_source()
+        parts = {"extrinsics": self._source_from_target().inverse(), "normal": normal, "distance": distance}
+        return self.between(self.target, self.source, None, **self.options, **parts)
+
+    def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> PlaneWarp:
+        """Return the warp of this plane between other cameras at the same places; extrinsics hold the rotation."""
+        if rotation is not None:
+            raise ValueError(f"{type(self).__name__}: rotation must be None, as extrinsics hold it; got one")
+        options = {**self.own_parts(), **options}
+        options.pop("tolerance", None)
+        return PlaneWarp(source, target, **options)
+
+    def own_parts(self, index: list[int] | None = None) -> dict[str, Any]:
+        assert index is None  # augmentations, which take rows, make no such warps
+        return {"extrinsics": self.extrinsics, "normal": self.normal, "distance": self.distance}
+
+    def _source_from_target(self) -> Extrinsics:
+        return Extrinsics.from_matrix(self._pose()).freeze_like(self.extrinsics)
 
 
 class BirdsEye(PlaneWarp):
@@ -210,6 +225,14 @@ class BirdsEye(PlaneWarp):
         """Return camera from a camera at (0, 0, 1) that looks down: its x, y and z are the ground's x, -y and -z."""
         rotation, shift = super()._pose()
         return rotation * rotation.new_tensor([1.0, -1.0, -1.0]), shift + rotation[..., 2]
+
+    def own_parts(self, index: list[int] | None = None) -> dict[str, Any]:
+        return {**super().own_parts(index), "extrinsics": self._source_from_target()}  # of a `PlaneWarp` to any target
+
+    def detach(self) -> BirdsEye:
+        options: Any = {name: value for name, value in self.options.items() if name != "tolerance"}
+        options |= {"x": self.x, "y": self.y, "resolution": self.resolution}
+        return BirdsEye(self.source.detach(), self.extrinsics.detach(), **options)
 
     @property
     def grid_points(self) -> Tensor:

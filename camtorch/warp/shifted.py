@@ -57,10 +57,12 @@ class ShiftedWarp(Warp):
         self.register_buffer("distance", distance, persistent=False)
         self._found: tuple[Tensor, Tensor] | None = None
 
-    def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> ShiftedWarp:
-        """Return the warp of these rows of a batch, whose cameras and rotations are given."""
-        depth = self.distance[index][:, None]
-        return ShiftedWarp(source, target, rotation, depth, "distance", self.shift[index], **self.options)
+    def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
+        return ShiftedWarp(source, target, rotation, **{**self.own_parts(), **options})
+
+    def own_parts(self, index: list[int] | None = None) -> dict[str, Any]:
+        rows = slice(None) if index is None else index
+        return {"depth": self.distance[rows][:, None], "kind": "distance", "shift": self.shift[rows]}
 
     def inverse(self) -> Warp:
         raise ValueError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Literal, cast, get_args
 
 import torch
@@ -12,7 +11,7 @@ from typing_extensions import Unpack
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import as_own, known_false, values_of
 from camtorch.optics.special import cosc_root, sinc_root
-from camtorch.poses.rotations import as_rotation
+from camtorch.poses.rotations import as_rotation, transposed
 from camtorch.values.arguments import (
     LEFT,
     Numbers,
@@ -210,29 +209,16 @@ class ShutterWarp(MirrorWarp):
 
     def inverse(self) -> Warp:
         """Return the warp from target to source. It applies the shutter that this one undoes, and undoes the other."""
-        rotation = None if self.rotation is None else self.rotation.mT
-        options = {**self.options, "shutter": self.target_shutter, "target_shutter": self.shutter}
-        return self.between(self.target, self.source, rotation, **options)
+        shutters = {"shutter": self.target_shutter, "target_shutter": self.shutter}
+        return self.between(self.target, self.source, transposed(self.rotation), **self.options, **shutters)
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
         """Return this warp between other cameras, with its shutters unless `options` have others."""
-        options = {"shutter": self.shutter, "target_shutter": self.target_shutter, **options}
-        return ShutterWarp(source, target, **options).turned_by(rotation)
+        return ShutterWarp(source, target, **{**self.own_parts(), **options}).turned_by(rotation)
 
-    def detach(self) -> Warp:
-        rotation = None if self.rotation is None else self.rotation.detach()
-        return self._with(RollingShutter.detach, self.source.detach(), self.target.detach(), rotation)
-
-    def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
-        return self._with(lambda shutter: shutter.rows_of(index), source, target, rotation)
-
-    def follow(self, first: Warp) -> Warp:
-        return self.between(first.source, first.target, first.rotation, **self.options)
-
-    def _with(self, change: Callable[[RollingShutter], RollingShutter], *between: Any) -> Warp:
+    def own_parts(self, index: list[int] | None = None) -> dict[str, Any]:
         both = {"shutter": self.shutter, "target_shutter": self.target_shutter}
-        shutters: Any = {name: None if each is None else change(each) for name, each in both.items()}
-        return self.between(*between, **self.options, **shutters)
+        return {name: each if each is None or index is None else each.rows_of(index) for name, each in both.items()}
 
 
 class InMotion:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from camtorch.cameras.camera import Camera
 from camtorch.native.structs import OUTSIDE
-from camtorch.poses.rotations import as_rotation, turn
+from camtorch.poses.rotations import as_rotation, transposed, turn
 from camtorch.values.arguments import (
     LEFT,
     Numbers,
@@ -281,25 +281,31 @@ class Warp(CameraPair):
 
     def inverse(self) -> Warp:
         """Return the warp from target to source. Pixels outside the image, or between its pixels, stay lost."""
-        rotation = None if self.rotation is None else self.rotation.mT
-        return self.between(self.target, self.source, rotation, **self.options)
+        return self.between(self.target, self.source, transposed(self.rotation), **self.options)
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
-        """Return a warp like this one, mirrored or not, between other cameras."""
+        """Return a warp like this one, mirrored or not, between other cameras.
+
+        A kind of warp that is made of more than cameras, such as a shutter, keeps that unless `options` have another.
+        """
         return Warp(source, target, rotation, **options)
+
+    def own_parts(self, index: list[int] | None = None) -> dict[str, Any]:
+        """Return what the warp, or these rows of a batch, is made of besides cameras, rotation and options.
+
+        Names are those that `between` takes. A kind that has parts overrides both.
+        """
+        return {}
 
     def detach(self) -> Warp:
         """Return the same warp, which does not learn."""
-        rotation = None if self.rotation is None else self.rotation.detach()
-        return self.between(self.source.detach(), self.target.detach(), rotation, **self.options)
+        parts = {"rotation": self.rotation, **self.own_parts()}
+        parts = {name: part.detach() if hasattr(part, "detach") else part for name, part in parts.items()}
+        return self.between(self.source.detach(), self.target.detach(), **self.options, **parts)
 
     def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
         """Return the warp of these rows of a batch, whose cameras and rotations are given."""
-        return self.between(source, target, rotation, **self.options)
-
-    def follow(self, first: Warp) -> Warp:
-        """Return this warp after `first`, as one warp that keeps the lens of `first`."""
-        raise NotImplementedError
+        return self.between(source, target, rotation, **self.options, **self.own_parts(index))
 
     @property
     def options(self) -> Options:

@@ -2,12 +2,15 @@
 
 import copy
 import pickle
+from functools import partial
 
 import pytest
 import torch
 
 import camtorch as ct
 from camtorch.poses.rotations import rotation_matrix
+from camtorch.warp.affine import AffineWarp, MirrorWarp
+from camtorch.warp.shifted import ShiftedWarp
 
 SIZE, SMALL = (24, 32), (10, 14)
 NUMBERS = {
@@ -174,6 +177,43 @@ def test_it_is_copied_and_mapped(kind):
     if kind in WARPS:
         mapped = torch.func.vmap(lambda image: warp(image[None])[0])(images)
         torch.testing.assert_close(mapped, expected, rtol=0, atol=2e-4)
+
+
+# kinds that augmentations make: two samples each
+EDIT = torch.tensor([[[0.5, 0, 1], [0, 0.6, 2]], [[0.4, 0, 3], [0, 0.5, 1]]]).double()
+DEPTHS = torch.ones(2, 1, *SIZE).double()
+BATCHED = {
+    "turned": lambda p: turned(MirrorWarp, p, antialias=None),
+    "edited": lambda p: AffineWarp(source(p), target(p), EDIT.clone().requires_grad_(), None),
+    "shifted": lambda p: turned(partial(ShiftedWarp, depth=DEPTHS, kind="z", shift=p["shift"]), p),
+}
+
+
+@pytest.mark.parametrize("kind", [*WARPS, *(f"augmented {kind}" for kind in BATCHED)])
+def test_detached_and_row_by_row_it_keeps_all_that_it_is_made_of(kind):
+    names = (*CAMERAS, "shift", "readout", "rates", "normal", "distance")
+    given = {name: torch.tensor(NUMBERS[name]).double() * torch.tensor([[1.0], [1.1]]).double() for name in names}
+    given = {name: value[:, 0] if name in ("readout", "distance") else value for name, value in given.items()}
+    learning = BATCHED[kind.split()[1]](given) if "augmented" in kind else KINDS[kind][0](given)
+    images, points = smooth(2), torch.rand(2, 7, 2).double() * 20
+    expected, warp = results(learning, images, points), learning.detach()
+    assert (type(warp), warp.options) == (type(learning), learning.options)
+    assert not any(t.requires_grad for part in (warp, *warp.children()) for t in (*part.parameters(), *part.buffers()))
+    for one, other in zip(results(warp, images, points), expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-9)
+    if "shifted" not in kind:
+        back = warp.inverse()
+        assert not any(t.requires_grad for t in (*back.parameters(), *back.buffers()))
+        assert type(back) is (ct.PlaneWarp if kind == "above" else type(warp))
+    if kind == "above":
+        assert torch.equal(warp.grid_points, learning.grid_points)
+    if kind in ("plane", "above"):
+        return
+    rotation = None if warp.rotation is None else warp.rotation[[1]]
+    row = warp.rows_of(warp.source[[1]], warp.target[[1]], rotation, [1])
+    assert type(row) is type(warp)
+    for one, other in zip(results(row, images[1:], points[1:]), expected, strict=True):
+        torch.testing.assert_close(one, other[1:], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.uint16, torch.float16, torch.float32])
