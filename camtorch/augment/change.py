@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -19,11 +19,10 @@ from camtorch.projection.evaluation import camera_rows
 from camtorch.projection.native_cameras import Native
 from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import remade
-from camtorch.warp.affine import AffineWarp, MirrorWarp, after
+from camtorch.warp.affine import AffineWarp, MirrorWarp, after, unchecked
 from camtorch.warp.boxes import corners_of, in_order
 from camtorch.warp.options import Mode, Options
 from camtorch.warp.panorama import seam_of
-from camtorch.warp.shifted import ShiftedWarp
 from camtorch.warp.warp import Warp
 
 _HALF = 5e-3  # absolute: rotations that were half precision on the way are the same ones
@@ -44,6 +43,9 @@ def as_is(camera: Camera, rows: Tensor) -> Tensor:
 class LazyWarp:
     """A warp to cameras of which native code wrote the numbers; warp and cameras become modules at first use."""
 
+    keeps_lens: ClassVar[bool] = False  # these answer as a warp does
+    may_mirror: ClassVar[bool] = True
+    moves_by_cameras: ClassVar[bool] = True
     base: Camera  # of whose model the new cameras are
     intrinsics: np.ndarray[Any, Any]  # (4,) of one, or (B, 4)
     distortion: np.ndarray[Any, Any]  # (n,) of one, or (B, n)
@@ -78,6 +80,10 @@ class LazyWarp:
         distortion = distortion.as_subclass(nn.Parameter) if k.shape[-1] else distortion
         return remade(self.base, intrinsics=intrinsics, distortion=distortion, image_size=self.image_size)
 
+    def transform_positions(self, points: Tensor) -> Tensor:
+        """Return points (B, *N, 3) of the source's frame in the target's."""
+        return turn(self.rotation, points, "points")
+
     def warp(self, source: Camera) -> Warp:
         if self.made is None:
             self.made = MirrorWarp(source, self.target, self.rotation, **self.options)
@@ -111,7 +117,7 @@ class Part:
     @property
     def image_size(self) -> tuple[int, int]:
         """(height, width) after the change."""
-        return self.moves.image_size if isinstance(self.moves, LazyWarp) else self.target.size_for("Warp")
+        return self.camera.size_for("Warp") if self.moves is None else self.moves.image_size
 
     def with_warps(self, change: Callable[[Warp], Warp]) -> Part:
         """Return the part with each of its warps changed."""
@@ -120,15 +126,14 @@ class Part:
 
     def with_options(self, options: Options) -> Part:
         """Return the part with its warps made anew by other options."""
-
-        def optioned(warp: Warp) -> Warp:
-            if isinstance(warp, MirrorWarp) and warp.options == options:
-                return warp
-            make = warp.between if isinstance(warp, MirrorWarp) else MirrorWarp
-            return make(warp.source, warp.target, warp.rotation, **options)
-
         if isinstance(self.moves, LazyWarp):
             return replace(self, moves=replace(self.moves, options=options))
+
+        def optioned(warp: Warp) -> Warp:
+            if warp.options == options:
+                return warp
+            return unchecked(warp, warp.source, warp.target, warp.rotation, options)
+
         return self.with_warps(optioned)
 
     def take(self, index: list[int]) -> Part:
@@ -152,21 +157,12 @@ class Part:
             return self
         if first is None:
             return replace(second, camera=self.camera)
-        if not isinstance(last, LazyWarp) and last.keeps_lens:
-            return self.with_warps(lambda warp: last.between(warp.source, warp.target, warp.rotation, **last.options))
-        turned, rotation = first.rotation, last.rotation  # (3, 3) or (B, 3, 3): the first turn, then the second
-        if turned is not None and rotation is not None:
-            dtype = torch.promote_types(turned.dtype, rotation.dtype)
-            turned = (rotation.to(dtype).unsqueeze(-1) * turned.to(dtype).unsqueeze(-3)).sum(-2)
-        rotation = rotation if turned is None else turned
+        if last.keeps_lens:
+            made = second.warp
+            return self.with_warps(lambda warp: made.between(warp.source, warp.target, warp.rotation, **made.options))
+        rotation = _turned(first.rotation, last.rotation)
         if isinstance(last, AffineWarp):
-            size = last.target.image_size
-            if isinstance(first, AffineWarp):
-                matrix = after(last.map, first.map)
-                return replace(self, moves=AffineWarp(self.camera, edited(self.camera, matrix, size), matrix, rotation))
-            light = None if self.light is None else last(self.light, padding_mode="border")
-            moved = self.with_warps(lambda warp: MirrorWarp(self.camera, edited(warp.target, last.map, size), rotation))
-            return replace(moved, light=light)
+            return self._edited(last, rotation)
         if self.shades is not None or self.light is not None:
             raise ValueError(
                 "Compose: chromatic and vignetting must be those of the last lens of a chain; got an earlier one, "
@@ -179,6 +175,24 @@ class Part:
             return replace(second, camera=self.camera, moves=moves)
         moved = second.with_warps(lambda warp: MirrorWarp(self.camera, warp.target, rotation))
         return replace(moved, camera=self.camera)
+
+    def _edited(self, edit: AffineWarp, rotation: Tensor | None) -> Part:
+        """Return this part, then an edit, as one part; the rotation is that of both."""
+        size = edit.target.image_size
+        if isinstance(self.moves, AffineWarp):
+            matrix = after(edit.map, self.moves.map)
+            return replace(self, moves=AffineWarp(self.camera, edited(self.camera, matrix, size), matrix, rotation))
+        light = None if self.light is None else edit(self.light, padding_mode="border")
+        moved = self.with_warps(lambda warp: MirrorWarp(self.camera, edited(warp.target, edit.map, size), rotation))
+        return replace(moved, light=light)
+
+
+def _turned(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    """Return the rotation (3, 3) or (B, 3, 3) of two in turn; None is none."""
+    if first is None or second is None:
+        return second if first is None else first
+    dtype = torch.promote_types(first.dtype, second.dtype)
+    return (second.to(dtype).unsqueeze(-1) * first.to(dtype).unsqueeze(-3)).sum(-2)
 
 
 def _single(camera: Camera) -> Native | None:
@@ -288,7 +302,7 @@ class Change:
     @property
     def mirrored(self) -> Tensor | None:
         """(count,) bool: which samples are seen in a mirror; None if none is."""
-        turns = [part.rotation if isinstance(part.moves, (LazyWarp, MirrorWarp)) else None for part in self.parts]
+        turns = [part.rotation if part.moves is not None and part.moves.may_mirror else None for part in self.parts]
         if all(turn is None for turn in turns):
             return None
         x, y, z = self._turns(turns).unbind(-2)
@@ -474,15 +488,15 @@ class Change:
         """Move points (count, *N, 3) of the camera frame: they turn, and shift if the camera moves."""
 
         def move(part: Part, rows: Tensor) -> Tensor:
-            if isinstance(part.moves, ShiftedWarp):
-                return part.moves.transform_positions(rows)
-            return rows.clone() if part.rotation is None else turn(part.rotation, rows, "points")
+            assert part.moves is not None
+            moved = part.moves.transform_positions(rows)
+            return moved.clone() if moved is rows else moved
 
         return self.each(points, move)
 
     def distance(self, distance: Tensor) -> Tensor:
         """Move distances from the camera (count, C, H, W); unknown ones are 0."""
-        return self.each(distance, lambda part, rows: narrow(_distance(part.warp, widen(rows)), rows.dtype))
+        return self.each(distance, lambda part, rows: narrow(part.warp.moved_distance(widen(rows)), rows.dtype))
 
     def depth(self, depth: Tensor) -> Tensor:
         """Move depths along z (count, 1, H, W), positive in front; unknown ones are 0.
@@ -498,21 +512,14 @@ class Change:
 
         def move(part: Part, rows: Tensor) -> Tensor:
             warp = part.warp
-            if isinstance(warp, AffineWarp):
-                return _distance(warp, rows)
+            if warp.keeps_depth:
+                return warp.moved_distance(rows)
             wide = widen(rows)
             before, after = (ahead(camera, wide) for camera in (warp.source, warp.target))
             distance = torch.where(before.abs() > 1e-6, wide / before, 0.0)
-            return narrow(_distance(warp, distance) * after, rows.dtype)
+            return narrow(warp.moved_distance(distance) * after, rows.dtype)
 
         return self.each(depth, move)
-
-
-def _distance(warp: Warp, distance: Tensor) -> Tensor:
-    """Return distances (n, C, H, W) from the warp's target; unknown ones are 0."""
-    if isinstance(warp, ShiftedWarp):
-        return warp.moved_distance(distance)
-    return warp.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0)
 
 
 def by_kinds(

@@ -18,7 +18,7 @@ from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import is_unknown
 from camtorch.native.library import native_available
 from camtorch.values.module import remade
-from camtorch.warp.affine import MirrorWarp
+from camtorch.warp.affine import unchecked
 
 _twins = Kept(16)
 
@@ -103,8 +103,7 @@ def _remade(parts: Sequence[Part], change: Callable[[list[Tensor]], list[Tensor]
         rotation, light = (None if t is None else next(numbers) for t in (part.rotation, part.light))
         warps = []
         for host, target in zip([part.warp, *(part.shades or ())], targets, strict=True) if targets else ():
-            make = host.between if isinstance(host, MirrorWarp) else MirrorWarp  # `between` checks less
-            warps.append(make(source, target, rotation, **host.options).follow_host(host))
+            warps.append(unchecked(host, source, target, rotation, host.options).follow_host(host))
         shades = (warps[1], warps[2]) if part.shades else None
         made.append(replace(part, moves=warps[0] if warps else None, camera=source, shades=shades, light=light))
     return made

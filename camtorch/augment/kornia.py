@@ -23,7 +23,7 @@ from torch import Tensor
 
 from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.change import Change, LazyWarp, Part
+from camtorch.augment.change import Change, Part
 from camtorch.augment.containers import KIND, Params, camera_of, kind_of_camera, with_boxes, with_cameras
 from camtorch.augment.front_end import FrontEnd, check_front_end, check_single
 from camtorch.augment.kornia_parts import input_metadata_only, transform_output_shape
@@ -37,9 +37,8 @@ from camtorch.models import Pinhole
 from camtorch.optics.radial_inverse import precise
 from camtorch.values.arguments import as_part, no_camera
 from camtorch.values.dtypes import narrow, widen
-from camtorch.warp.affine import AffineWarp, MirrorWarp
+from camtorch.warp.affine import AffineWarp
 from camtorch.warp.options import Mode
-from camtorch.warp.warp import Warp
 
 Flags: TypeAlias = dict[str, Any]
 _BACK = "back"  # the flag for moving back
@@ -264,7 +263,7 @@ def _homographies(part: Part, rows: Tensor) -> Tensor:
         last = moves.matrix.new_tensor([0.0, 0.0, 1.0]).expand(*moves.matrix.shape[:-2], 1, 3)
         return torch.cat((moves.matrix, last), -2).expand_as(rows)
     before, after, turn = part.camera, part.target, part.rotation
-    plain = isinstance(moves, LazyWarp) or type(moves) in (Warp, MirrorWarp)  # others move by depth or by row
+    plain = moves is not None and moves.moves_by_cameras  # others move by depth or by row
     if not plain or kind(before)[:2] != kind(after)[:2] or not (turn is None or isinstance(after, Pinhole)):
         return torch.full_like(rows, torch.nan)
     turned = torch.linalg.inv_ex(precise(before.K))[0]

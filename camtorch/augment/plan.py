@@ -20,11 +20,9 @@ from camtorch.native.library import native_available
 from camtorch.native.structs import EDGE_POINTS
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import thread_count
-from camtorch.warp.affine import MirrorWarp
 from camtorch.warp.boxes import along_edges, around, corners_of, in_order
 from camtorch.warp.options import Options, Sampler
 from camtorch.warp.samples import Label, MovedField, call_for, natives_of
-from camtorch.warp.warp import Warp
 
 _OUTLINES = "pixels", "boxes"
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
@@ -136,7 +134,7 @@ class SamplePlan:
             if way == "pixels" or (way == "boxes" and known_true(in_order(value).all())):
                 given[name] = rows = self.rows(value)
                 outlines.append(rows if way == "pixels" else along_edges(corners_of(rows), EDGE_POINTS))
-        if len(given) < 2 or type(warp) not in (Warp, MirrorWarp):  # others move points by more than their cameras
+        if len(given) < 2 or not warp.moves_by_cameras:  # others move points by more than their cameras
             return {}
         moved, mapped = warp.move(torch.cat([outline.flatten(1, -2) for outline in outlines], 1))
         counts, results = [outline.shape[1:-1].numel() for outline in outlines], dict[str, MovedField]()

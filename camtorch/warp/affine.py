@@ -24,7 +24,7 @@ from camtorch.warp import compiled
 from camtorch.warp.grid import coarse
 from camtorch.warp.lattice import Lattice, PixelPositions, straight_lattice
 from camtorch.warp.moving import placed
-from camtorch.warp.options import PaddingMode, Sampler
+from camtorch.warp.options import Options, PaddingMode, Sampler
 from camtorch.warp.panorama import lengths
 from camtorch.warp.plan import Route
 from camtorch.warp.sampling import SHRINKS, render
@@ -54,6 +54,7 @@ class Way(NamedTuple):
 class MirrorWarp(Warp):
     """A `Warp` whose rotation may be a mirror; antialias=None halves images that shrink by more than 1.5."""
 
+    may_mirror = True
     map: Map | None = None
 
     def __init__(
@@ -136,7 +137,7 @@ class MirrorWarp(Warp):
             return result
         if way.box:
             left, top, right, bottom = way.box
-            images, size = images[..., top:bottom, left:right], self.target.size_for("Warp")
+            images, size = images[..., top:bottom, left:right], self.image_size
             made = _resized(images, size, sampler.mode, way.flips)
             return made if out is None else out.copy_(made)
         sampler = sampler._replace(padding_mode=way.padding_mode)
@@ -149,7 +150,7 @@ class MirrorWarp(Warp):
         return render(images, where if rows is None else where.cameras(rows), *sampler)
 
     def _empty(self, images: Tensor) -> Tensor:
-        cameras, size = self.batch_shape.numel(), self.target.size_for("Warp")
+        cameras, size = self.batch_shape.numel(), self.image_size
         count = len(images) if cameras == 1 else cameras
         if not are_plain(images):
             return images.new_empty(count, images.shape[1], *size)
@@ -166,7 +167,8 @@ class AffineWarp(MirrorWarp):
     along the axes, maps source pixels (u, v, 1) to target pixels; `rotation` is its effect on rays.
     """
 
-    is_an_operator = False
+    moves_by_cameras = False
+    keeps_depth = True
     seam = None
     map: Map
     matrix: Tensor
@@ -206,7 +208,7 @@ class AffineWarp(MirrorWarp):
     def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[Way] | None:
         least: float = 1 if self.antialias else SHRINKS if self._decides else math.inf
         least, decides = least if smooth else math.inf, smooth and self._decides and route == "kept"
-        sizes = self.source.size_for("Warp"), self.target.size_for("Warp")
+        sizes = self.source.size_for("Warp"), self.image_size
         return [_way(rows, *sizes, sampler.padding_mode, least, decides) for rows in self._numbers]
 
     @property
@@ -214,7 +216,7 @@ class AffineWarp(MirrorWarp):
         return [self.matrix]
 
     def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> PixelPositions | Lattice:
-        width = self.target.size_for("Warp")[1]
+        width = self.image_size[1]
         back = inverted(self.matrix.reshape(-1, 2, 3))
         side = back.new_tensor(self.source.size_for("Warp")[::-1])[:, None]
         # pixels to positions: (2 u + 1) / W - 1
@@ -242,6 +244,12 @@ class AffineWarp(MirrorWarp):
             matrix = matrix.reshape(-1, *[1] * (pixels.ndim - 2), 2, 3)
         moved = (matrix[..., :2] * wide.unsqueeze(-2)).sum(-1) + matrix[..., 2]
         return placed(self.target, moved.to(torch.promote_types(pixels.dtype, torch.float32)), valid, on_image)
+
+
+def unchecked(warp: Warp, source: Camera, target: Camera, rotation: Tensor | None, options: Options) -> Warp:
+    """Return a warp like another one between other cameras, of which neither cameras nor rotation are checked."""
+    make = MirrorWarp if warp.moves_by_cameras else warp.between
+    return make(source, target, rotation, **options)
 
 
 def _resized(images: Tensor, size: Sequence[int], mode: str = "bilinear", flips: tuple[int, ...] = ()) -> Tensor:

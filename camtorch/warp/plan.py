@@ -93,8 +93,10 @@ class KeptPositions:
 class CameraPair(GeometryModule):
     """The state of a `Warp`: source, target, rotation and options; and where target pixels lie."""
 
-    is_an_operator: ClassVar[bool] = True  # compiled graphs may call it as one, as cameras and rotation are all of it
+    moves_by_cameras: ClassVar[bool] = True  # False: by more than cameras and rotation, which one call could take
     keeps_lens: ClassVar[bool] = False  # True: after another warp both are one, `between` the cameras of that
+    keeps_depth: ClassVar[bool] = False  # True: depths along the axis stay, as the camera does
+    may_mirror: ClassVar[bool] = False  # True: the rotation may be a mirror
     batch_shape: torch.Size
     padding_mode: PaddingMode
     _tolerance: float | None
@@ -125,7 +127,8 @@ class CameraPair(GeometryModule):
 
     def __dir__(self) -> list[str]:
         """Return the names that users call, without those by which packages and other kinds of warps ask this one."""
-        inside = {*vars(CameraPair), *dir(GeometryModule), "rows_of", "own_parts"}
+        inside = {*vars(CameraPair), *dir(GeometryModule)}
+        inside |= {"rows_of", "own_parts", "transform_positions", "moved_distance"}
         inside -= {"source", "target", "rotation", "tolerance", *dir(nn.Module)}
         names: list[str] = super().__dir__()  # type: ignore[no-untyped-call]
         return [name for name in names if name not in inside]
@@ -143,6 +146,11 @@ class CameraPair(GeometryModule):
         if rotation is not None and rotation.shape[:-2] != self.batch_shape:
             self.batch_shape = broadcast_shapes(self.batch_shape, rotation.shape[:-2])
         return self
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(height, width) of the images to make."""
+        return self.target.size_for("Warp")
 
     @property
     def is_pinned(self) -> bool:
@@ -243,7 +251,7 @@ class CameraPair(GeometryModule):
     @property
     def knows_operator(self) -> bool:
         """Whether there is an operator for a warp of this kind, whose cameras are of one model each."""
-        return self.is_an_operator and not (self.source.is_mixed or self.target.is_mixed)
+        return self.moves_by_cameras and not (self.source.is_mixed or self.target.is_mixed)
 
     def ready(self, images: object, mode: str | None, padding: str | None) -> Call | None:
         """Return the call that an earlier one has left for images of this form, if nothing has changed since."""

@@ -47,7 +47,7 @@ class PlaneWarp(Warp):
             fit; and as `Warp`. TypeError: If a camera is no Camera, or extrinsics are no Extrinsics.
     """
 
-    is_an_operator = False
+    moves_by_cameras = False
     batch_shape: torch.Size
     normal: Tensor
     distance: Tensor
@@ -114,7 +114,7 @@ class PlaneWarp(Warp):
     def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> PixelPositions:
         if not self.antialias:
             return PixelPositions(*self._of_rows(rows), None)
-        return scaled_rows(self.sampled, rows, self.target.size_for("Warp")[0], self._of_rows)
+        return scaled_rows(self.sampled, rows, self.image_size[0], self._of_rows)
 
     def _of_rows(self, rows: range) -> tuple[Tensor, Tensor]:
         pixels = pixels_of_rows(self.target, rows)

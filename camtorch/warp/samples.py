@@ -44,7 +44,7 @@ _PIXELS = 1 << structs.LEFT_BITS  # C multiplies flags about pixels by this, to 
 def natives_of(warp: CameraPair) -> tuple[Native, Native, Tensor | None] | None:
     """Return source, target and rotation of a warp for native code; None if it has to go step by step."""
     source, target, rotation = warp.source, warp.target, warp.rotation
-    if not warp.is_an_operator or warp.is_pinned or goes_round(source) is not None or goes_round(target) is not None:
+    if not warp.moves_by_cameras or warp.is_pinned or goes_round(source) is not None or goes_round(target) is not None:
         return None
     made = compiled_of((source, target), target.intrinsics, *(() if rotation is None else (rotation,)))
     return None if made is None else (*made[0], rotation)  # type: ignore[return-value]

@@ -29,7 +29,7 @@ class ShiftedWarp(Warp):
     Each ray of the target is followed to the nearest surface that the source sees; without one it is not mapped.
     """
 
-    is_an_operator: ClassVar[bool] = False
+    moves_by_cameras: ClassVar[bool] = False
     seam = None
     shift: Tensor
     distance: Tensor  # (B, H, W): along the rays of the source; 0 if unknown
@@ -103,7 +103,7 @@ class ShiftedWarp(Warp):
     def _surface(self) -> tuple[Tensor, Tensor]:
         """Return the source's pixel (B, H', W', 2) that shows what each target pixel sees, and whether there is one."""
         if self._found is None:
-            size = self.target.size_for("Warp")
+            size = self.image_size
             rays, has_ray = self.target.rays()
             far = self._nearest(size).flatten(1)
             count = len(far)

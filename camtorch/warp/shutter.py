@@ -170,7 +170,7 @@ class ShutterWarp(MirrorWarp):
         ValueError: If batch dims do not fit, and as `Warp`. TypeError: If a shutter is no `RollingShutter`.
     """
 
-    is_an_operator = False
+    moves_by_cameras = False
     keeps_lens = True
     _has_shutters = True
     shutter: RollingShutter | None

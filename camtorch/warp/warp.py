@@ -273,6 +273,14 @@ class Warp(CameraPair):
         rays = as_coordinates(rays, "rays", 3, "Warp", self.source.intrinsics.device, "B, *N")
         return turn(self.rotation, rays, "rays")
 
+    def transform_positions(self, points: Tensor) -> Tensor:
+        """Return points (B, *N, 3) of the source's frame in the target's."""
+        return turn(self.rotation, points, "points")
+
+    def moved_distance(self, distance: Tensor) -> Tensor:
+        """Return distances (B, C, H, W) from the source as distances (B, C, H', W') from the target, 0 for none."""
+        return self.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0)
+
     def __getattr__(self, name: str) -> Tensor | nn.Module:
         try:
             return super().__getattr__(name)
