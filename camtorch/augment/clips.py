@@ -8,8 +8,9 @@ from typing import Any
 
 import torch
 
-from camtorch.augment.fields import OWN, PLACE, kind_of
+from camtorch.augment.fields import OWN, PLACE
 from camtorch.augment.matrices import check_alike
+from camtorch.augment.names import kind_of
 from camtorch.cameras.camera import Camera
 
 

@@ -20,11 +20,12 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch import augment
-from camtorch.augment.fields import OWN, is_text, kind_of
+from camtorch.augment.fields import OWN
 from camtorch.augment.front_end import FrontEnd
 from camtorch.augment.kornia_parts import BasicAugmentationBase, ParamItem
 from camtorch.augment.matrices import Guess
 from camtorch.augment.matrices import camera_of as camera_by
+from camtorch.augment.names import is_text, kind_of
 from camtorch.augment.sample import Sample, Single, detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import collate_cameras

@@ -1,27 +1,22 @@
-"""The kinds of fields in a sample, a table: how each is found by its name, checked, and moved."""
+"""The kinds of fields in a sample, a table: how each is recognised, checked and moved."""
 
 from __future__ import annotations
 
-import difflib
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from camtorch.augment.change import Change
-from camtorch.augment.matrices import NAMES, SHAPE, SIDES, check_matrix, matrix_hint, moved_matrix
-from camtorch.cameras.camera import Camera
-from camtorch.evaluate.door import may_look, pytree
+from camtorch.augment.matrices import SHAPE, SIDES, check_matrix, matrix_hint, moved_matrix
 from camtorch.evaluate.tensors import known_false, known_true
 from camtorch.poses.rotations import are_rotations, check_rotation, is_right, rotation_matrix, rotation_vector
-from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians, warn
+from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians
 from camtorch.values.dtypes import widen
-from camtorch.warp import arrays
 from camtorch.warp.options import Options, Sampler
 from camtorch.warp.samples import Label
 
@@ -47,24 +42,25 @@ def _no_check(value: Tensor, name: str, owner: str) -> None:
     pass
 
 
-@dataclass(frozen=True)
+@dataclass(kw_only=True)
 class Field:
     """A kind of field: how its values are recognised, checked and moved."""
 
     dims: int  # the least number of dims of a single sample
-    most_dims: int  # the most
-    last: tuple[int, ...]  # what its last dim may be; empty: anything
+    most_dims: int = 0  # the most; by default as many
+    ends: Sequence[tuple[int, ...]] = ()  # what its last dims may be; empty: anything
     shape: str  # in words, of a batch
     move: Move  # (change, batch, options) -> batch, or (batch, valid)
-    _: KW_ONLY
-    sides: tuple[tuple[int, int], ...] = ()  # of matrices: what rows and columns may be
-    decides: bool = False  # whether its number of dims distinguishes a batch from a sample
+    by_c: Label | Literal["never"] | Callable[[Options, float], Sampler] | None = None
+    """How the call of C for whole samples moves it, as `move` would: (options, mask_fill) -> sampler for images. None:
+    that call leaves it to `move`; "never": it needs each pixel's position, and the call is made for no such sample."""
+    tells_batches: bool = False  # whether its number of dims distinguishes a batch from a sample
     in_pixels: bool = False  # whether it is warned of numbers that hardly are pixels of the image
     hint: Callable[[str, Tensor, bool], str] = _no_hint  # (name, value, batched) -> what to do about a wrong shape
     check: Callable[[Tensor, str, str], None] = _no_check  # (value, name, owner); raises if values are of no such kind
-    way: Label | Callable[[Options, float], Sampler] | None = None
-    """How the call of C for whole samples moves it, as `move` would: (options, mask_fill) -> sampler for images."""
-    apart: bool = False  # whether it needs each pixel's position: that call then moves none of a sample's fields
+
+    def __post_init__(self) -> None:
+        self.most_dims = max(self.dims, self.most_dims)
 
 
 def _by(method: Callable[..., Any], *forms: Callable[[Tensor], Tensor]) -> Move:
@@ -80,6 +76,10 @@ def _planes(move: Move) -> Move:
         return moved.squeeze(1) if value.ndim == 3 else moved
 
     return of
+
+
+def _labels(change: Change, masks: Tensor, options: Mapping[str, float]) -> Tensor:
+    return change.labels(masks, options["mask_fill"])
 
 
 def _columns(matrix: Tensor) -> Tensor:
@@ -138,8 +138,17 @@ def _sided_boxes(kind: str, form: str) -> Field:
                 "x1, y1, x2, y2 are of the kind 'boxes'"
             )
 
-    shape, move = f"(B, M, 4) pixels {form}", _by(Change.boxes, functools.partial(as_corners, kind), write)
-    return Field(2, 2, (4,), shape, move, decides=True, in_pixels=True, hint=_boxes_hint, check=check_sides)
+    shape = f"(B, M, 4) pixels {form}"
+    return Field(
+        dims=2,
+        ends=[(4,)],
+        shape=shape,
+        move=_by(Change.boxes, functools.partial(as_corners, kind), write),
+        tells_batches=True,
+        in_pixels=True,
+        hint=_boxes_hint,
+        check=check_sides,
+    )
 
 
 def _image_hint(name: str, value: Tensor, batched: bool) -> str:
@@ -255,164 +264,139 @@ def _mask_sampler(options: Options, mask_fill: float) -> Sampler:
     return Sampler("nearest", "zeros", (mask_fill,))
 
 
-_MOST_DIMS = 16
-_points, _boxes, _positions, _rays = _by(Change.points), _by(Change.boxes), _by(Change.positions), _by(Change.rays)
-_pitch_yaw, _rotation = _by(Change.rays, from_pitch_yaw, to_pitch_yaw), _by(Change.rays, _columns, _columns)
-_labels = _planes(lambda change, masks, options: change.labels(masks, options["mask_fill"]))
+_MANY = 16  # dims: any number
 _DIRECTIONS = Field(
-    1, _MOST_DIMS, (3,), "(B, *N, 3) directions of the camera frame", _rays, hint=_rays_hint, way="rays"
+    dims=1,
+    most_dims=_MANY,
+    ends=[(3,)],
+    shape="(B, *N, 3) directions of the camera frame",
+    move=_by(Change.rays),
+    by_c="rays",
+    hint=_rays_hint,
 )
-_DEPTHS = "(B, 1, H, W) or (B, H, W), along"
-_KEYPOINTS = "(B, N, 2) or (B, F, N, 2) pixels x, y"
-_LANDMARKS = "(B, N, 2) pixels or (B, N, 3) points of the camera frame"
-_BOXES = "(B, M, 4) pixels x1, y1, x2, y2"
-_POSES = "(B, 4, 4) or (B, 3, 4), camera from head"
-_RVEC = "(B, 3), a rotation vector, camera from head"
-_TVEC = "(B, 3), a point of the camera frame"
-_GAZE = "(B, *N, 2) pitch and yaw of a gaze in radians"
 _POSE = Field(
-    2, 2, (4,), _POSES, _pose, sides=((4, 4), (3, 4)), decides=True, hint=_pose_hint, check=_check_pose, way="pose"
+    dims=2,
+    ends=[(4, 4), (3, 4)],
+    shape="(B, 4, 4) or (B, 3, 4), camera from head",
+    move=_pose,
+    by_c="pose",
+    tells_batches=True,
+    hint=_pose_hint,
+    check=_check_pose,
 )
 KINDS = {
-    "image": Field(3, 3, (), "(B, C, H, W)", _by(Change.images), decides=True, hint=_image_hint, way=_image_sampler),
-    "mask": Field(2, 3, (), "(B, C, H, W) or (B, H, W)", _labels, way=_mask_sampler),
-    "depth": Field(2, 3, (), f"{_DEPTHS} z", _planes(_by(Change.depth)), apart=True),
-    "distance": Field(2, 3, (), f"{_DEPTHS} the ray", _planes(_by(Change.distance)), apart=True),
-    "keypoints": Field(
-        2, 3, (2,), _KEYPOINTS, _points, decides=True, in_pixels=True, hint=_keypoints_hint, way="pixels"
+    "image": Field(
+        dims=3, shape="(B, C, H, W)", move=_by(Change.images), by_c=_image_sampler, tells_batches=True, hint=_image_hint
     ),
-    "polygons": Field(3, 3, (2,), "(B, M, K, 2) corners x, y", _points, decides=True, way="pixels"),
+    "mask": Field(dims=2, most_dims=3, shape="(B, C, H, W) or (B, H, W)", move=_planes(_labels), by_c=_mask_sampler),
+    "depth": Field(
+        dims=2, most_dims=3, shape="(B, 1, H, W) or (B, H, W), along z", move=_planes(_by(Change.depth)), by_c="never"
+    ),
+    "distance": Field(
+        dims=2,
+        most_dims=3,
+        shape="(B, 1, H, W) or (B, H, W), along the ray",
+        move=_planes(_by(Change.distance)),
+        by_c="never",
+    ),
+    "keypoints": Field(
+        dims=2,
+        most_dims=3,
+        ends=[(2,)],
+        shape="(B, N, 2) or (B, F, N, 2) pixels x, y",
+        move=_by(Change.points),
+        by_c="pixels",
+        tells_batches=True,
+        in_pixels=True,
+        hint=_keypoints_hint,
+    ),
+    "polygons": Field(
+        dims=3,
+        ends=[(2,)],
+        shape="(B, M, K, 2) corners x, y",
+        move=_by(Change.points),
+        by_c="pixels",
+        tells_batches=True,
+    ),
     "boxes": Field(
-        2, 2, (4,), _BOXES, _boxes, decides=True, in_pixels=True, hint=_boxes_hint, check=_check_corners, way="boxes"
+        dims=2,
+        ends=[(4,)],
+        shape="(B, M, 4) pixels x1, y1, x2, y2",
+        move=_by(Change.boxes),
+        by_c="boxes",
+        tells_batches=True,
+        in_pixels=True,
+        hint=_boxes_hint,
+        check=_check_corners,
     ),
     "boxes_xywh": _sided_boxes("boxes_xywh", "x, y, width, height"),
     "boxes_cxcywh": _sided_boxes("boxes_cxcywh", "x and y of the centre, width, height"),
-    "landmarks": Field(2, 3, (2, 3), _LANDMARKS, _points, decides=True, in_pixels=True, hint=_landmarks_hint),
+    "landmarks": Field(
+        dims=2,
+        most_dims=3,
+        ends=[(2,), (3,)],
+        shape="(B, N, 2) pixels or (B, N, 3) points of the camera frame",
+        move=_by(Change.points),
+        tells_batches=True,
+        in_pixels=True,
+        hint=_landmarks_hint,
+    ),
     "points": Field(
-        1, _MOST_DIMS, (3,), "(B, *N, 3) points of the camera frame", _positions, hint=_column_hint, way="rays"
+        dims=1,
+        most_dims=_MANY,
+        ends=[(3,)],
+        shape="(B, *N, 3) points of the camera frame",
+        move=_by(Change.positions),
+        by_c="rays",
+        hint=_column_hint,
     ),
     "gaze": _DIRECTIONS,
     "directions": _DIRECTIONS,
-    "pitch_yaw": Field(1, _MOST_DIMS, (2,), _GAZE, _pitch_yaw, check=_check_pitch_yaw),
+    "pitch_yaw": Field(
+        dims=1,
+        most_dims=_MANY,
+        ends=[(2,)],
+        shape="(B, *N, 2) pitch and yaw of a gaze in radians",
+        move=_by(Change.rays, from_pitch_yaw, to_pitch_yaw),
+        check=_check_pitch_yaw,
+    ),
     "head_pose": _POSE,
     "pose": _POSE,
     "rvec": Field(
-        1, 1, (3,), _RVEC, _rvec, decides=True, hint=_column_hint, check=check_radians, way="rotation vectors"
+        dims=1,
+        ends=[(3,)],
+        shape="(B, 3), a rotation vector, camera from head",
+        move=_rvec,
+        by_c="rotation vectors",
+        tells_batches=True,
+        hint=_column_hint,
+        check=check_radians,
     ),
-    "tvec": Field(1, 1, (3,), _TVEC, _positions, decides=True, hint=_column_hint, way="rays"),
-    "rotation": Field(2, 2, (3,), "(B, 3, 3), turned so far", _rotation, hint=_column_hint, way="columns"),
-    "K": Field(2, 2, (3, 4), SHAPE, moved_matrix, sides=SIDES, decides=True, hint=matrix_hint, check=check_matrix),
+    "tvec": Field(
+        dims=1,
+        ends=[(3,)],
+        shape="(B, 3), a point of the camera frame",
+        move=_by(Change.positions),
+        by_c="rays",
+        tells_batches=True,
+        hint=_column_hint,
+    ),
+    "rotation": Field(
+        dims=2,
+        ends=[(3,)],
+        shape="(B, 3, 3), turned so far",
+        move=_by(Change.rays, _columns, _columns),
+        by_c="columns",
+        hint=_column_hint,
+    ),
+    "K": Field(
+        dims=2, ends=SIDES, shape=SHAPE, move=moved_matrix, tells_batches=True, hint=matrix_hint, check=check_matrix
+    ),
 }
 BOXES = "boxes", *_PLACED
-ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
-ALIASES |= {name: "K" for name in NAMES if name != "K"}
 PLACE = "crop_place"
 """The place of a sample's crop, which follows its camera and rotation through all augmentations."""
 OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
-
-
-_PLACES = {
-    "roi": "boxes",
-    **dict.fromkeys(("eye", "pupil", "nose", "mouth", "corner", "center", "centre"), "keypoints"),
-}
-_ANGLES = {"yaw", "pitch", "roll"}
-_OFF = 0.1  # of the image's sides: keypoints so far outside of it are not of it
-_RANKS = {kind: (not field.decides, i) for i, (kind, field) in enumerate(KINDS.items())}
-
-
-def kind_of(name: str, value: object, own: Mapping[str, str], owner: str, single: bool = False) -> str | None:
-    """Return a field's key in `KINDS`, None if it is not moved; raise if it may be geometry of unknown name.
-
-    In this order: the name among the option `fields`; names that end with _valid do not move; a kind's name or an
-    alias; a pattern with * among `fields`; the longest kind that begins the name; the forms of boxes that end it.
-    """
-    if not isinstance(name, str):
-        raise TypeError(f"{owner}: a sample must have strings for names; got {name!r:.80}")
-    if name in own:
-        return None if own[name] == KEEP else own[name]
-    if name.endswith("_valid"):
-        return None
-    base = name if name in KINDS else ALIASES.get(name)
-    if base is None and (pattern := pattern_of(name, own)) is not None:
-        return None if own[pattern] == KEEP else own[pattern]
-    if base == "K":  # a number of things, or the path of a file, may be named so
-        array = isinstance(value, (Tensor, np.ndarray)) and value.ndim > 1
-        return base if array or _may_be_geometry(name, value, single) else None
-    # image_path and mask_id, of a sample or a batch, are no images or masks
-    if base is None and isinstance(value, (Tensor, np.ndarray, list, tuple)) and not is_text(value):
-        # K_inv is no K; compilers do not know max with a key
-        begins = sorted((k for k in KINDS if name.startswith(k + "_") and k != "K"), key=len)
-        base = begins[-1] if begins else None
-    if base == "boxes" and (form := f"boxes_{name.rpartition('_')[2]}") in _PLACED:  # as boxes_face_xywh
-        base = form
-    if base is None and _may_be_geometry(name, value, single):
-        if isinstance(value, Mapping):
-            raise ValueError(
-                f"{owner}: fields that move must be at the top of samples; got real numbers in the dict {name!r}. "
-                f"Put them there, or keep the dict with fields={{{name!r}: '{KEEP}'}}"
-            )
-        close = _close_to(name)
-        meant = f"Did you mean {close[0]!r}? " if close else ""
-        if _is_angle(name):
-            meant = "A head's angles go in as head_pose, by ct.head_rotation(), a gaze's as pitch_yaw. "
-        if not {"K", "intrinsics", "matrix"}.isdisjoint(name.split("_")):
-            meant = "A camera goes in as camera=, as ct.BrownConrady.from_matrix(K, D, image_size=(height, width)). "
-        raise ValueError(
-            f"{owner}: {name!r} must have a kind, by which its numbers move with the camera; got real numbers. {meant}"
-            f"Pass fields={{{name!r}: KIND}}, with KIND one of {', '.join(KINDS)} or {KEEP}, to leave it unchanged"
-        )
-    return base
-
-
-def pattern_of(name: str, own: Mapping[str, str]) -> str | None:
-    """Return the first pattern in `own`, with a * for any characters, that a name matches."""
-    for key in own:
-        head, star, tail = key.partition("*")
-        if star and len(name) >= len(head + tail) and name.startswith(head) and name.endswith(tail):
-            return key
-    return None
-
-
-def is_text(value: Any) -> bool:
-    """Whether a value holds strings, at least one, and nothing else, in lists of any depth."""
-    texts = pytree.tree_leaves(value.tolist() if isinstance(value, np.ndarray) and value.dtype.kind in "OSU" else value)
-    return len(texts) > 0 and all(isinstance(text, (str, bytes)) for text in texts)
-
-
-@functools.lru_cache(64)
-def _close_to(name: str) -> list[str]:
-    """Return the kind that a name may mean: of the whole, or of its last word, as in `face_bbox` and `left_eye`."""
-    last = name.rpartition("_")[2].removesuffix("s")
-    if name.startswith("seg") or "box" in last or last in _PLACES:
-        return ["mask" if name.startswith("seg") else "boxes" if "box" in last else _PLACES[last]]
-    return difflib.get_close_matches(name, KINDS, 1) or difflib.get_close_matches(last, KINDS, 1)
-
-
-def _may_be_geometry(name: str, value: Any, single: bool, above: int = 0) -> bool:
-    """Whether a value holds real numbers, or integers with more than a row per sample or with a name like a kind's.
-
-    above: the number of lists around the value, which count as dims. A single number is geometry if its name is an
-    angle's, as in `head_yaw`.
-    """
-    if isinstance(value, Mapping):
-        return any(_may_be_geometry(str(key), item, single) for key, item in value.items())
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        value = value.tolist()
-    if isinstance(value, (list, tuple)):
-        return any(_may_be_geometry(name, item, single, above + 1) for item in value)
-    if isinstance(value, (np.ndarray, np.generic)):
-        whole, known = value.dtype.kind in "iub", value.dtype.kind in "iubfcV"
-    elif isinstance(value, Tensor):
-        whole, known = not (value.is_floating_point() or value.is_complex()), True
-    else:
-        whole, known = not isinstance(value, float), isinstance(value, (int, float))
-    dims, row = above + getattr(value, "ndim", 0), 1 if single else 2
-    known_as = (dims == row and _close_to(name)) or (not whole and _is_angle(name))
-    return known and (dims > (row if whole else 0) or bool(known_as))
-
-
-def _is_angle(name: str) -> bool:
-    return not _ANGLES.isdisjoint(name.lower().split("_"))
 
 
 def field_of(kind: str, value: Tensor) -> Field:
@@ -420,104 +404,3 @@ def field_of(kind: str, value: Tensor) -> Field:
     if kind != "landmarks":
         return KINDS[kind]
     return KINDS["points" if value.shape[-1] == 3 else "keypoints"]
-
-
-def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
-    """Return the value of a field as a tensor of real numbers."""
-    if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
-        value = arrays.as_tensor(value, name, owner)
-    if not isinstance(value, Tensor) or value.dtype.is_complex:
-        what = f"dtype {value.dtype}" if isinstance(value, (Tensor, np.ndarray)) else type(value).__name__
-        hint = _hint(name)
-        if isinstance(value, (list, tuple, int, float)):
-            hint = ". Plain numbers go in as torch.tensor(numbers); a list has a tensor for each sample"
-        elif kind == "image" and hasattr(value, "mode"):
-            hint = f". {FRONT_ENDS}"
-        raise TypeError(f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}{hint}")
-    if kind not in IMAGES and not value.dtype.is_floating_point:
-        value = value.to(torch.get_default_dtype())  # whole pixels do not stay whole
-    return value
-
-
-def _hint(name: str) -> str:
-    return "" if name in KINDS else f". If it is something else, fields={{{name!r}: '{KEEP}'}} keeps it unchanged"
-
-
-def check_shape(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> None:
-    """Raise a ValueError if a kind does not take this shape."""
-    field, shape = KINDS[kind], tuple(value.shape)
-    fits = field.dims <= len(shape) - batched <= field.most_dims and (not field.last or shape[-1] in field.last)
-    if not fits or (field.sides and shape[-2:] not in field.sides):
-        what = field.shape if batched else field.shape.replace("(B, ", "(")
-        hint = f". {hint}" if (hint := field.hint(name, value, batched)) else _hint(name)
-        raise ValueError(f"{owner}: {name} must be {what}; got shape {shape}{hint}")
-
-
-def warn_of_numbers(kind: str, name: str, value: Tensor, flags: Any, size: Sequence[int], owner: str) -> None:
-    """Warn of labels that seem to be parts of an image's sides, of an image of another size, or to mean "not seen"."""
-    if not KINDS[kind].in_pixels or not value.is_cpu:
-        return
-    are_points = value.shape[-1] == 2
-    pixels = value[..., :2] if value.shape[-1] == 3 else value
-    if are_points and _are_off(value, flags, size):
-        warn(
-            f"{owner}: {name} must be pixels of the image, of (height, width) = {tuple(size)}; got most of them far "
-            "outside of it, as of an image of another size. Scale x by (x + 0.5) * width / old width - 0.5, and so y. "
-            f"For points that are not seen pass NaN, or {name}_valid=..., a flag for each"
-        )
-    if are_points and flags is None and known_true((pixels == -1).all(-1).any()):
-        warn(
-            f"{owner}: {name} has points at (-1, -1), which move as any pixels. If these are not seen, pass NaN, or "
-            f"{name}_valid=..., a flag for each"
-        )
-    if value.numel() <= 3 or not known_true((pixels == pixels.clamp(0, 1)).all() & (pixels % 1 != 0).any()):
-        return
-    if value.shape[-1] != 3:
-        form = "pixels" if are_points else KINDS[kind].shape.partition(") ")[2]
-        places = " from x and y" if kind in _PLACED else ""
-        warn(
-            f"{owner}: {name} must be {form}; got values within [0, 1], as parts of an image's sides. Multiply them by "
-            f"width and height, and subtract 0.5{places}"
-        )
-    elif known_true((value[..., 2] <= 0).any()):
-        warn(
-            f"{owner}: {name} must be points of the camera frame, in front of it; got x and y within [0, 1] and z of 0 "
-            f"or less, as a detector's. Pass pixels, {name}[..., :2] times width and height, less 0.5"
-        )
-
-
-def _are_off(points: Tensor, flags: Any, size: Sequence[int]) -> bool:
-    """Whether most points (..., 2), of those that are seen, are off the image by more than a tenth of its sides."""
-    if not points.numel() or not may_look(points):
-        return False
-    places, sides = points.detach().reshape(-1, 2), (size[1], size[0])
-    ends = zip(places.amin(0).tolist(), places.amax(0).tolist(), sides, strict=True)
-    if all(-_OFF * side < low and high < (1 + _OFF) * side - 1 for low, high, side in ends):  # as in most samples
-        return False
-    seen = torch.isfinite(places).all(-1)
-    if flags is not None and (given := torch.as_tensor(flags)).numel() == len(seen):
-        seen = seen & (given.reshape(-1) != 0)
-    off = ((places + 0.5) / places.new_tensor(sides) - 0.5).abs().amax(-1) > 0.5 + _OFF
-    return int((off & seen).sum()) > int(seen.sum()) / 2
-
-
-def is_batch(named: Named, camera: object) -> bool:
-    """Whether `named` is a batch, by its first image, pixels, boxes or pose, else by cameras, else any field."""
-    if isinstance(camera, (list, tuple)):
-        return True
-    for kind, value in sorted(named.values(), key=lambda pair: _RANKS[pair[0]]):
-        if isinstance(value, (list, tuple)):
-            return True
-        if KINDS[kind].decides:
-            return bool(value.ndim > KINDS[kind].dims)
-    if isinstance(camera, Camera) and camera.batch_shape:
-        return True
-    return any(value.ndim > KINDS[kind].dims for kind, value in named.values())
-
-
-def in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return values in a dtype, which may be narrower: finite values stay finite."""
-    if dtype == torch.float16 != values.dtype:
-        most = torch.finfo(dtype).max
-        values = values.clamp(-most, most)
-    return values.to(dtype)

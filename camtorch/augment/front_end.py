@@ -7,8 +7,8 @@ from typing import Any
 
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
-from camtorch.augment.fields import as_tensor
 from camtorch.augment.matrices import Guess, camera_of
+from camtorch.augment.reading import as_tensor
 from camtorch.augment.sample import KeepsCamera, SampleTransform, Unknown
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import GUESS_CAMERA, shown

@@ -18,8 +18,9 @@ from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.fields import ALIASES, IMAGES, KINDS, OWN, PLACE, kind_of
+from camtorch.augment.fields import IMAGES, KINDS, OWN, PLACE
 from camtorch.augment.front_end import FrontEnd, check_front_end
+from camtorch.augment.names import ALIASES, kind_of
 from camtorch.augment.sample import Sample, Single
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
@@ -226,5 +227,5 @@ def _numbers(value: Any, name: str, kind: str | None) -> Any:
     if isinstance(value, (list, tuple)):
         with contextlib.suppress(TypeError, ValueError):
             value = np.asarray(value, np.float32)
-            value = value.reshape(0, *KINDS[kind].last[:1]) if not value.size and KINDS[kind].last else value
+            value = value.reshape(0, KINDS[kind].ends[0][-1]) if not value.size and KINDS[kind].ends else value
     return value.astype(np.float32) if isinstance(value, np.ndarray) and value.dtype.kind in "iub" else value

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.change import Change, LazyWarp, Part
-from camtorch.augment.fields import KINDS, field_of, in_range
+from camtorch.augment.fields import KINDS, field_of
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_free, are_numbers, known_true
@@ -119,7 +119,7 @@ class SamplePlan:
         for name in others:  # which were computed in the dtype of the cameras
             if name in results:
                 rows, valid = results[name]
-                results[name] = in_range(rows, values[name].dtype), valid
+                results[name] = _in_range(rows, values[name].dtype), valid
         return results
 
     def _pixels_at_once(self, part: Part, values: Mapping[str, Any]) -> dict[str, MovedField]:
@@ -130,7 +130,7 @@ class SamplePlan:
             value = values[name]
             if isinstance(value, list) or value.dtype != dtype or value.ndim - self.batched > KINDS[kind].most_dims:
                 continue
-            way = field_of(kind, value).way
+            way = field_of(kind, value).by_c
             if way == "pixels" or (way == "boxes" and known_true(in_order(value).all())):
                 given[name] = rows = self.rows(value)
                 outlines.append(rows if way == "pixels" else along_edges(corners_of(rows), EDGE_POINTS))
@@ -159,11 +159,10 @@ class SamplePlan:
         ways: dict[str, Sampler | Label] = {}
         for name, kind in self.fields.items():
             value = values[name]
-            if KINDS[kind].apart or isinstance(value, list):
+            if isinstance(value, list) or (way := field_of(kind, value).by_c) == "never":
                 return {}
             if value.ndim - self.batched > KINDS[kind].most_dims:  # frames
                 continue
-            way = field_of(kind, value).way
             if callable(way):
                 sampler = way(options, self.mask_fill)
                 ways |= {name: sampler} if len(sampler.fill) == 1 or len(sampler.fill) == value.shape[-3] else {}
@@ -200,4 +199,12 @@ def move(change: Change, kind: str, value: Tensor, options: Mapping[str, float])
     result = field_of(kind, value).move(change, value, options)
     result, valid = result if isinstance(result, tuple) else (result, None)
     # geometry is computed in float32 at least; what came in half precision goes out in it
-    return in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid
+    return _in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid
+
+
+def _in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return values in a dtype, which may be narrower: finite values stay finite."""
+    if dtype == torch.float16 != values.dtype:
+        most = torch.finfo(dtype).max
+        values = values.clamp(-most, most)
+    return values.to(dtype)

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from camtorch.augment.fields import IMAGES, KINDS, OWN, PLACE, Named, as_tensor, check_shape, kind_of, warn_of_numbers
+import numpy as np
+import torch
+from torch import Tensor
+
+from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS, OWN, PLACE, Named
+from camtorch.augment.names import kind_of
+from camtorch.cameras.camera import Camera
+from camtorch.evaluate.door import may_look
+from camtorch.evaluate.tensors import known_true
+from camtorch.values.arguments import warn
 from camtorch.values.dtypes import check_averaged
+from camtorch.warp import arrays
 from camtorch.warp.warp import as_sized
+
+_OFF = 0.1  # of the image's sides: keypoints so far outside of it are not of it
+_RANKS = {kind: (not field.tells_batches, i) for i, (kind, field) in enumerate(KINDS.items())}
+"""Kinds that tell a batch from a sample first, then in the order of `KINDS`."""
 
 
 def moving(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str, single: bool = False) -> Named:
@@ -110,3 +124,96 @@ def _check_size(field: str, shape: tuple[int, ...], name: str, size: tuple[int, 
         f"{owner}: {field} must be of {name}'s image_size {size}; got {shape[-2:]} (height, width). camera.resize, "
         ".crop and .pad give the camera of an edited image"
     )
+
+
+def as_tensor(value: object, name: str, kind: str, owner: str) -> Tensor:
+    """Return the value of a field as a tensor of real numbers."""
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
+        value = arrays.as_tensor(value, name, owner)
+    if not isinstance(value, Tensor) or value.dtype.is_complex:
+        what = f"dtype {value.dtype}" if isinstance(value, (Tensor, np.ndarray)) else type(value).__name__
+        hint = _hint(name)
+        if isinstance(value, (list, tuple, int, float)):
+            hint = ". Plain numbers go in as torch.tensor(numbers); a list has a tensor for each sample"
+        elif kind == "image" and hasattr(value, "mode"):
+            hint = f". {FRONT_ENDS}"
+        raise TypeError(f"{owner}: {name} must be a tensor of real numbers, {KINDS[kind].shape}; got {what}{hint}")
+    if kind not in IMAGES and not value.dtype.is_floating_point:
+        value = value.to(torch.get_default_dtype())  # whole pixels do not stay whole
+    return value
+
+
+def _hint(name: str) -> str:
+    return "" if name in KINDS else f". If it is something else, fields={{{name!r}: '{KEEP}'}} keeps it unchanged"
+
+
+def check_shape(kind: str, name: str, value: Tensor, batched: bool, owner: str) -> None:
+    """Raise a ValueError if a kind does not take this shape."""
+    field, shape = KINDS[kind], tuple(value.shape)
+    fits = not field.ends or any(shape[-len(end) :] == end for end in field.ends)
+    if not fits or not field.dims <= len(shape) - batched <= field.most_dims:
+        what = field.shape if batched else field.shape.replace("(B, ", "(")
+        hint = f". {hint}" if (hint := field.hint(name, value, batched)) else _hint(name)
+        raise ValueError(f"{owner}: {name} must be {what}; got shape {shape}{hint}")
+
+
+def warn_of_numbers(kind: str, name: str, value: Tensor, flags: Any, size: Sequence[int], owner: str) -> None:
+    """Warn of labels that seem to be parts of an image's sides, of an image of another size, or to mean "not seen"."""
+    if not KINDS[kind].in_pixels or not value.is_cpu:
+        return
+    are_points = value.shape[-1] == 2
+    pixels = value[..., :2] if value.shape[-1] == 3 else value
+    if are_points and _are_off(value, flags, size):
+        warn(
+            f"{owner}: {name} must be pixels of the image, of (height, width) = {tuple(size)}; got most of them far "
+            "outside of it, as of an image of another size. Scale x by (x + 0.5) * width / old width - 0.5, and so y. "
+            f"For points that are not seen pass NaN, or {name}_valid=..., a flag for each"
+        )
+    if are_points and flags is None and known_true((pixels == -1).all(-1).any()):
+        warn(
+            f"{owner}: {name} has points at (-1, -1), which move as any pixels. If these are not seen, pass NaN, or "
+            f"{name}_valid=..., a flag for each"
+        )
+    if value.numel() <= 3 or not known_true((pixels == pixels.clamp(0, 1)).all() & (pixels % 1 != 0).any()):
+        return
+    if value.shape[-1] != 3:
+        form = "pixels" if are_points else KINDS[kind].shape.partition(") ")[2]
+        places = " from x and y" if kind.startswith("boxes_") else ""
+        warn(
+            f"{owner}: {name} must be {form}; got values within [0, 1], as parts of an image's sides. Multiply them by "
+            f"width and height, and subtract 0.5{places}"
+        )
+    elif known_true((value[..., 2] <= 0).any()):
+        warn(
+            f"{owner}: {name} must be points of the camera frame, in front of it; got x and y within [0, 1] and z of 0 "
+            f"or less, as a detector's. Pass pixels, {name}[..., :2] times width and height, less 0.5"
+        )
+
+
+def _are_off(points: Tensor, flags: Any, size: Sequence[int]) -> bool:
+    """Whether most points (..., 2), of those that are seen, are off the image by more than a tenth of its sides."""
+    if not points.numel() or not may_look(points):
+        return False
+    places, sides = points.detach().reshape(-1, 2), (size[1], size[0])
+    ends = zip(places.amin(0).tolist(), places.amax(0).tolist(), sides, strict=True)
+    if all(-_OFF * side < low and high < (1 + _OFF) * side - 1 for low, high, side in ends):  # as in most samples
+        return False
+    seen = torch.isfinite(places).all(-1)
+    if flags is not None and (given := torch.as_tensor(flags)).numel() == len(seen):
+        seen = seen & (given.reshape(-1) != 0)
+    off = ((places + 0.5) / places.new_tensor(sides) - 0.5).abs().amax(-1) > 0.5 + _OFF
+    return int((off & seen).sum()) > int(seen.sum()) / 2
+
+
+def is_batch(named: Named, camera: object) -> bool:
+    """Whether `named` is a batch, by its first image, pixels, boxes or pose, else by cameras, else any field."""
+    if isinstance(camera, (list, tuple)):
+        return True
+    for kind, value in sorted(named.values(), key=lambda pair: _RANKS[pair[0]]):
+        if isinstance(value, (list, tuple)):
+            return True
+        if KINDS[kind].tells_batches:
+            return bool(value.ndim > KINDS[kind].dims)
+    if isinstance(camera, Camera) and camera.batch_shape:
+        return True
+    return any(value.ndim > KINDS[kind].dims for kind, value in named.values())

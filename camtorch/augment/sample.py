@@ -14,12 +14,12 @@ from typing_extensions import Self
 from camtorch.augment.change import Change, one_or_batch
 from camtorch.augment.clips import Clips
 from camtorch.augment.devices import remember_camera
-from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS, Named, is_batch
+from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS, Named
 from camtorch.augment.keywords import check_arguments
 from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess, camera_of, check_agrees, check_targets, refuse
 from camtorch.augment.plan import Batch, SamplePlan, form_of, move
-from camtorch.augment.reading import check_cameras, check_fields, check_one_size, moving
+from camtorch.augment.reading import check_cameras, check_fields, check_one_size, is_batch, moving
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept

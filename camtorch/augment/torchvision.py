@@ -18,9 +18,11 @@ from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Change
-from camtorch.augment.fields import IMAGES, KEEP, KINDS, OWN, PLACE, as_tensor, kind_of, pattern_of
+from camtorch.augment.fields import IMAGES, KEEP, KINDS, OWN, PLACE
 from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
 from camtorch.augment.matrices import Guess
+from camtorch.augment.names import kind_of, pattern_of
+from camtorch.augment.reading import as_tensor
 from camtorch.augment.sample import Frames, Sample, detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree

@@ -12,7 +12,8 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Part
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.fields import IMAGES, KEEP, KINDS, kind_of
+from camtorch.augment.fields import IMAGES, KEEP, KINDS
+from camtorch.augment.names import kind_of
 from camtorch.augment.numpy import Transform
 from camtorch.augment.sample import Sample
 from camtorch.cameras.camera import Camera
@@ -109,7 +110,7 @@ def _dense(name: str, value: Any, kind: str = "") -> Any:
             raise ValueError(f"{name} must be numbers in lists of one length; got {value!r:.80}") from None
         if array.size or kind not in KINDS:
             return array
-        return array.reshape(*[0] * (KINDS[kind].dims - 1), *KINDS[kind].last)
+        return array.reshape(*[0] * (KINDS[kind].dims - 1), *(end[-1] for end in KINDS[kind].ends[:1]))
     if isinstance(value, np.ndarray) and value.dtype == object:
         parts = [_dense(name, part) for part in value]
         if parts and all(isinstance(part, np.ndarray) and part.shape == parts[0].shape for part in parts):

@@ -1,0 +1,137 @@
+"""The kind of a field by its name: a kind's own, an alias, a pattern, or one that begins with a kind."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+from collections.abc import Mapping
+from typing import Any, NoReturn
+
+import numpy as np
+from torch import Tensor
+
+from camtorch.augment.fields import BOXES, KEEP, KINDS
+from camtorch.augment.matrices import NAMES
+from camtorch.evaluate.door import pytree
+
+ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
+ALIASES |= {name: "K" for name in NAMES if name != "K"}
+_PLACES = {
+    "roi": "boxes",
+    **dict.fromkeys(("eye", "pupil", "nose", "mouth", "corner", "center", "centre"), "keypoints"),
+}
+_ANGLES = {"yaw", "pitch", "roll"}
+
+
+def kind_of(name: str, value: object, fields: Mapping[str, str], owner: str, single: bool = False) -> str | None:
+    """Return a field's key in `KINDS`, None if it is not moved; raise if it may be geometry of unknown name.
+
+    In this order: the name among `fields`; names that end with _valid do not move; a kind's name or an alias; a pattern
+    with * among `fields`; the longest kind that begins the name; the forms of boxes that end it.
+
+    fields: the option of that name. single: whether the sample is known to be without a dim B.
+    """
+    if not isinstance(name, str):
+        raise TypeError(f"{owner}: a sample must have strings for names; got {name!r:.80}")
+    if name in fields:
+        return None if fields[name] == KEEP else fields[name]
+    if name.endswith("_valid"):
+        return None
+    kind = name if name in KINDS else ALIASES.get(name)
+    if kind is None and (pattern := pattern_of(name, fields)) is not None:
+        return None if fields[pattern] == KEEP else fields[pattern]
+    if kind == "K":
+        return _kind_of_matrix(name, value, single)
+    kind = kind or _beginning(name, value)
+    if kind == "boxes" and (form := f"boxes_{name.rpartition('_')[2]}") in BOXES:  # as boxes_face_xywh
+        kind = form
+    if kind is None and _may_be_geometry(name, value, single):
+        _refuse_unknown(name, value, owner)
+    return kind
+
+
+def _kind_of_matrix(name: str, value: object, single: bool) -> str | None:
+    """Return the kind of what is named as a camera's matrix: a number of things, or a file's path, may be named so."""
+    is_array = isinstance(value, (Tensor, np.ndarray)) and value.ndim > 1
+    return "K" if is_array or _may_be_geometry(name, value, single) else None
+
+
+def _beginning(name: str, value: object) -> str | None:
+    """Return the longest kind that begins a name; None for text: an image_path or a mask_id is no image or mask."""
+    if not isinstance(value, (Tensor, np.ndarray, list, tuple)) or is_text(value):
+        return None
+    # K_inv is no K; compilers do not know max with a key
+    begins = sorted((kind for kind in KINDS if name.startswith(kind + "_") and kind != "K"), key=len)
+    return begins[-1] if begins else None
+
+
+def _refuse_unknown(name: str, value: object, owner: str) -> NoReturn:
+    """Raise the ValueError for geometry of unknown name, which says what it may be."""
+    if isinstance(value, Mapping):
+        raise ValueError(
+            f"{owner}: fields that move must be at the top of samples; got real numbers in the dict {name!r}. "
+            f"Put them there, or keep the dict with fields={{{name!r}: '{KEEP}'}}"
+        )
+    if not {"K", "intrinsics", "matrix"}.isdisjoint(name.split("_")):
+        meant = "A camera goes in as camera=, as ct.BrownConrady.from_matrix(K, D, image_size=(height, width)). "
+    elif _is_angle(name):
+        meant = "A head's angles go in as head_pose, by ct.head_rotation(), a gaze's as pitch_yaw. "
+    else:
+        meant = "".join(f"Did you mean {kind!r}? " for kind in _close_to(name))
+    raise ValueError(
+        f"{owner}: {name!r} must have a kind, by which its numbers move with the camera; got real numbers. {meant}"
+        f"Pass fields={{{name!r}: KIND}}, with KIND one of {', '.join(KINDS)} or {KEEP}, to leave it unchanged"
+    )
+
+
+def pattern_of(name: str, fields: Mapping[str, str]) -> str | None:
+    """Return the first key of `fields`, with a * for any characters, that a name matches."""
+    for key in fields:
+        head, star, tail = key.partition("*")
+        if star and len(name) >= len(head + tail) and name.startswith(head) and name.endswith(tail):
+            return key
+    return None
+
+
+def is_text(value: Any) -> bool:
+    """Whether a value holds strings, at least one, and nothing else, in lists of any depth."""
+    texts = pytree.tree_leaves(value.tolist() if isinstance(value, np.ndarray) and value.dtype.kind in "OSU" else value)
+    return len(texts) > 0 and all(isinstance(text, (str, bytes)) for text in texts)
+
+
+@functools.lru_cache(64)
+def _close_to(name: str) -> list[str]:
+    """Return the kind that a name may mean: of the whole, or of its last word, as in `face_bbox` and `left_eye`."""
+    last = name.rpartition("_")[2].removesuffix("s")
+    if name.startswith("seg") or "box" in last or last in _PLACES:
+        return ["mask" if name.startswith("seg") else "boxes" if "box" in last else _PLACES[last]]
+    return difflib.get_close_matches(name, KINDS, 1) or difflib.get_close_matches(last, KINDS, 1)
+
+
+def _may_be_geometry(name: str, value: Any, single: bool, above: int = 0) -> bool:
+    """Whether a value may have to move with the camera.
+
+    Real numbers with a dim may; integers with two dims per sample, or one dim and a name close to a kind's; and a
+    single real number whose name is an angle's, as in `head_yaw`.
+
+    above: the number of lists around the value, which count as dims.
+    """
+    if isinstance(value, Mapping):
+        return any(_may_be_geometry(str(key), item, single) for key, item in value.items())
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return any(_may_be_geometry(name, item, single, above + 1) for item in value)
+    if isinstance(value, (np.ndarray, np.generic)):
+        whole, known = value.dtype.kind in "iub", value.dtype.kind in "iubfcV"
+    elif isinstance(value, Tensor):
+        whole, known = not (value.is_floating_point() or value.is_complex()), True
+    else:
+        whole, known = not isinstance(value, float), isinstance(value, (int, float))
+    dims, row = above + getattr(value, "ndim", 0), 1 if single else 2
+    known_as = (dims == row and _close_to(name)) or (not whole and _is_angle(name))
+    return known and (dims > (row if whole else 0) or bool(known_as))
+
+
+def _is_angle(name: str) -> bool:
+    return not _ANGLES.isdisjoint(name.lower().split("_"))
