@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -17,7 +18,7 @@ from camtorch.augment.devices import Elsewhere, remember_camera, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.matrices import Guess
-from camtorch.augment.ranges import Range, draw
+from camtorch.augment.ranges import Range, draw_numbers, rows_of
 from camtorch.augment.reading import moving
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
@@ -148,15 +149,17 @@ class Augmentation(SampleTransform):
         self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
         """Draw as `draw` does, with another p and same_on_batch."""
-        numbers = self._raw_draw(count, p, same_on_batch, generator)
+        numbers = self._draw_numbers(count, p, same_on_batch, generator)
         return {
             name: torch.as_tensor(value, dtype=torch.bool if name == "apply" else torch.float64)
             for name, value in numbers.items()
         }
 
-    def _raw_draw(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
-        """Return the draw as lists, arrays or tensors; see the function `draw`."""
-        return draw(self.ranges, count, p, same_on_batch, generator)
+    def _draw_numbers(
+        self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None
+    ) -> dict[str, Any]:
+        """Return a draw as lists, arrays or tensors; see `ranges.py`."""
+        return draw_numbers(self.ranges, count, p, same_on_batch, generator)
 
     def with_boxes(self, draw: Mapping[str, Any], boxes: Tensor | Sequence[Tensor] | None) -> Mapping[str, Any]:
         """Return the draw, completed by the box that each sample's crop follows.
@@ -190,7 +193,7 @@ class Augmentation(SampleTransform):
         if own is None or isinstance(own, (int, float)):
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
             raise ValueError(f"{self._name}: camera must be given; got {own}. Please {how}. {GUESS_CAMERA}")
-        return self._change_where_drawn(one_or_batch(own), self._checked_draw(draw))
+        return self._change_where_drawn(one_or_batch(own), self._as_numbers(draw))
 
     def _change_where_drawn(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         """Return the change of a draw, computed where the draw is: on the CPU also for fixed cameras elsewhere."""
@@ -200,38 +203,38 @@ class Augmentation(SampleTransform):
         return Elsewhere(self._change(twin, draw), camera.intrinsics.device)
 
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
-        applied = draw["apply"]
-        count = len(applied)
+        """Return the change of a draw of any form."""
         if 0 < self.p < 1 and self.image_size not in (None, camera.image_size):
             raise ValueError(
                 f"{self._name}: with p < 1 the image_size must be that of the images, so that all come out alike; "
                 f"got image_size={self.image_size} for images of {camera.image_size}"
             )
+        applied, count = draw["apply"], len(draw["apply"])
+        chosen = _chosen(applied)
+        if chosen is not None and not all(chosen):
+            return self._change_of_some(camera, draw, chosen)
+        # if values may not be read, all rows are moved, and `gate` later keeps those that were not drawn
+        gate = applied if chosen is None and self.p != 1 else None
+        if not isinstance(camera, Mixed):
+            return Change(count, [self._part(camera, draw)], gate=gate)
+        return by_kinds(count, camera, lambda rows, source: self._part(source, rows_of(draw, rows)), gate)
 
-        def part(rows: list[int] | None, source: Camera) -> Part:
-            return self._part(source, draw if rows is None else {n: value[rows] for n, value in draw.items()})
-
-        looks = not isinstance(applied, Tensor) or may_look(applied) or count == 0
-        chosen = applied if isinstance(applied, list) else applied.tolist() if looks else []
-        if all(chosen):  # traced, all rows move, and a gate chooses
-            gate = None if looks or self.p == 1 else applied
-            if not isinstance(camera, Mixed):
-                return Change(count, [self._part(camera, draw)], gate=gate)
-            return by_kinds(count, camera, part, gate)
-        parts, camera = [], one_or_batch(camera)
+    def _change_of_some(self, camera: Camera, draw: Mapping[str, Any], chosen: Sequence[bool]) -> Change:
+        """Return the change that moves only the chosen samples."""
+        count, parts, camera = len(chosen), [], one_or_batch(camera)
         for rows, group in camera.groups if isinstance(camera, Mixed) else [(list(range(count)), camera)]:
             for moves in (True, False):
                 here = [n for n, row in enumerate(rows) if chosen[row] == moves]
                 if here:
                     source = group[here] if group.batch_shape and len(here) < len(rows) else group
-                    own = [rows[n] for n in here]
-                    parts.append(part(own, source) if moves else Part(source))
-                    parts[-1].rows = own
+                    samples = [rows[n] for n in here]
+                    part = self._part(source, rows_of(draw, samples)) if moves else Part(source)
+                    parts.append(replace(part, rows=samples))
         check_sizes((part.image_size for part in parts), self._name)
         return Change(count, parts, mixed=isinstance(camera, Mixed))
 
-    def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
-        """Check a draw, and return it as arrays unless it is recorded."""
+    def _as_numbers(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
+        """Check a draw that is given, and return it as arrays, or as tensors if numbers may not be read."""
         as_mapping(draw, "draw", self._name, "what draw() returns")
         sizes = {**{name: interval.size for name, interval in self.ranges.items()}, **dict.fromkeys(self.crops, 4)}
         if missing := [name for name in ("apply", *sizes) if name not in draw]:
@@ -251,7 +254,7 @@ class Augmentation(SampleTransform):
         return values
 
     def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
-        values = self._values(source, draw)
+        values = self._values_for(source, draw)
         target, rotation = self._new_camera(source, values)
         if self.min_filled:
             factor, turned, found = enough(source, target, rotation, self.min_filled)
@@ -263,7 +266,7 @@ class Augmentation(SampleTransform):
         """Return the part from a source to a target; `values` may change images in more ways, such as their light."""
         return Part(source, Warp(source, target, rotation, **self.options))
 
-    def _values(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
+    def _values_for(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
         """Return drawn values, (*B,) or (*B, size); without *B if all are alike, so that one map serves all samples."""
         if isinstance(draw["apply"], list):  # of one sample
             values = dict(zip(draw, map(_first, draw.values()), strict=True))  # without a loop of Python
@@ -276,10 +279,10 @@ class Augmentation(SampleTransform):
 
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         """Call `new_camera` with values as drawn."""
-        return self.new_camera(source, self._like(source, values))
+        return self.new_camera(source, self._as_tensors(source, values))
 
     @staticmethod
-    def _like(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
+    def _as_tensors(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return the values as tensors in the source's dtype and on its device."""
         dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
         return {n: torch.as_tensor(value, dtype=dtype, device=source.intrinsics.device) for n, value in values.items()}
@@ -304,11 +307,11 @@ class Augmentation(SampleTransform):
         if not are_known(camera.intrinsics):
             return
         self._calls.warned = True
-        values = draw(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
+        values = draw_numbers(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
         with torch.no_grad():
             first = camera.detach()
             first = first[[0] * _TRIES] if first.batch_shape else first
-            shares = filled(first, *self._new_camera(first, self._values(first, values)))
+            shares = filled(first, *self._new_camera(first, self._values_for(first, values)))
             own = filled(first, first, None)  # less than 1 if a fisheye shows a circle
         if shares.mean() < _FEW * own.mean():
             warn(
@@ -351,7 +354,7 @@ class Augmentation(SampleTransform):
             drawn = self.drawn(clips.shape[0], self.p, self.same_on_batch, generator) if draw is None else draw
             each = clips.shape[1]  # a draw takes the boxes that it needs from the first frame
             first = {n: (kind, value[::each]) for n, (kind, value) in moving(frames, self.fields, self._name).items()}
-            whole = self._of_sample(drawn, lambda: first)
+            whole = self._with_labels(drawn, lambda: first)
             draw = {n: clips.repeated(value, f"draw[{n!r}]") for n, value in whole.items()}
             return clips.restored(self.forward(frames, draw=draw))
         return self._augmented(sample, draw=draw, generator=generator)[0]
@@ -365,16 +368,17 @@ class Augmentation(SampleTransform):
     ) -> tuple[Sample, Change]:
         """Return a sample moved by one change, and the change; kinds: name -> kind, in addition to `fields`.
 
-        `_batch` finds what moves and by which cameras, `_raw_draw` draws, `_change` makes the new cameras, those of one
-        model by a call of `_part`, and `_moved` moves the fields.
+        `_batch` finds what moves and by which cameras, `_draw_numbers` draws, `_change` makes the new cameras, those of
+        one model by a call of `_part`, and `_moved` moves the fields.
         """
         batch = self._batch(sample, kinds=kinds)
         plan, camera, count = batch.plan, batch.camera, batch.plan.count
         if draw is None:
-            numbers = self._of_sample(self._raw_draw(count, self.p, self.same_on_batch, generator), batch.rows)
+            drawn = self._draw_numbers(count, self.p, self.same_on_batch, generator)
+            numbers = self._with_labels(drawn, batch.rows)
             change = (self._change if plan.is_cpu else self._change_where_drawn)(camera, numbers)
         else:
-            change = self.change(camera, self._of_sample(draw, batch.rows))
+            change = self.change(camera, self._with_labels(draw, batch.rows))
         if change.count != count:
             one = f"{{name: value.expand({count}, *value.shape[1:]) for name, value in draw.items()}} uses it for all"
             raise ValueError(
@@ -431,7 +435,7 @@ class Augmentation(SampleTransform):
         moved.pop(PLACE, None)  # what comes back is no crop
         return moved
 
-    def _of_sample(self, draw: Mapping[str, Any], rows: Callable[[], Named]) -> Mapping[str, Any]:
+    def _with_labels(self, draw: Mapping[str, Any], rows: Callable[[], Named]) -> Mapping[str, Any]:
         """Add to a draw the boxes that it needs of a sample: those named `boxes`, or the first of that kind."""
         if not self.crops:
             return draw
@@ -451,6 +455,13 @@ class Augmentation(SampleTransform):
         parts += [f"{name}={interval}" for name, interval in self.ranges.items()]
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])
+
+
+def _chosen(applied: Any) -> list[bool] | None:
+    """Return which samples a draw moves, (B,); None if values may not be read."""
+    if isinstance(applied, Tensor) and len(applied) and not may_look(applied):
+        return None
+    return applied if isinstance(applied, list) else applied.tolist()
 
 
 def _are_alike(value: Any) -> bool:

@@ -15,7 +15,7 @@ from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.change import Change, check_sizes
 from camtorch.augment.edits import Edit, change_by
 from camtorch.augment.landmarks import Mirroring
-from camtorch.augment.ranges import Range, draw
+from camtorch.augment.ranges import Range, draw_numbers
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import as_mapping
 
@@ -149,14 +149,14 @@ class Compose(Augmentation):
         """The augmentations in their order."""
         return cast("list[Augmentation]", list(self.augmentations))
 
-    def _raw_draw(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> dict[str, Any]:
-        values: dict[str, Any] = draw({}, count, p, same_on_batch, generator)
-        values["apply"] = values["apply"] if isinstance(values["apply"], Tensor) else np.asarray(values["apply"])
+    def _draw_numbers(
+        self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None
+    ) -> dict[str, Any]:
+        values = draw_numbers({}, count, p, same_on_batch, generator)
         for i, part in enumerate(self.parts):
-            own = part._raw_draw(count, part.p, same_on_batch or part.same_on_batch, generator)
-            for key, value in own.items():
-                values[f"{i}.{key}"] = value.double() if isinstance(value, Tensor) else np.asarray(value, np.float64)
-        return values
+            drawn = part._draw_numbers(count, part.p, same_on_batch or part.same_on_batch, generator)
+            values |= {f"{i}.{name}": value for name, value in drawn.items()}
+        return {name: value if isinstance(value, Tensor) else np.asarray(value) for name, value in values.items()}
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
         for part in self.parts:

@@ -234,7 +234,7 @@ class CameraDrawer(Augmentation):
         return found.warp(values, source if like is None and not self._is_real else found.base, self.options)
 
     def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
-        values = self._values(source, draw)
+        values = self._values_for(source, draw)
         made = self._lazy_warp(source, values, self.min_filled)
         if made is None:
             return super()._part(source, draw)
@@ -250,7 +250,7 @@ class CameraDrawer(Augmentation):
 
     def _part_between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
         """Return the part with the effect of the lens on colours and light."""
-        beside = self._like(source, {name: values[name] for name in self.beside_the_camera.intersection(values)})
+        beside = self._as_tensors(source, {name: values[name] for name in self.beside_the_camera.intersection(values)})
         cameras, light = [target], None
         if "chromatic" in beside:
             cameras += [scaled(target, 1 + beside["chromatic"][..., i]) for i in (0, 1)]

@@ -15,7 +15,7 @@ from typing_extensions import Unpack
 from camtorch.augment.augmentation import Augmentation, EditOptions, FlipOptions
 from camtorch.augment.change import Change, Part, by_kinds
 from camtorch.augment.landmarks import Mirroring, TableLike
-from camtorch.augment.ranges import Range, as_range
+from camtorch.augment.ranges import Range, as_range, rows_of
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited, quarter_turns
 from camtorch.evaluate.tensors import known_false, known_true
@@ -98,8 +98,7 @@ def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, o
         matrix: Map | None = None
         size = (source.height, source.width)
         for edit, draw in edits:
-            here = draw if rows is None else {name: value[rows] for name, value in draw.items()}
-            one, size = edit.map_of(here, size)
+            one, size = edit.map_of(rows_of(draw, rows), size)
             if one is not None:
                 matrix = one if matrix is None else after(one, matrix)
         if matrix is None:

@@ -137,8 +137,8 @@ class RandomMount(CameraDrawer):
         for name, each in zip(_SHIFTS, shift, strict=True):
             self.ranges[name] = as_range(each, "shift", self._name)
 
-    def _of_sample(self, draw: Mapping[str, Any], rows: Callable[[], Named]) -> Mapping[str, Any]:
-        draw = super()._of_sample(draw, rows) if self.crops else draw
+    def _with_labels(self, draw: Mapping[str, Any], rows: Callable[[], Named]) -> Mapping[str, Any]:
+        draw = super()._with_labels(draw, rows) if self.crops else draw
         if _SHIFTS[0] not in self.ranges:
             return draw
         named = rows()
@@ -151,8 +151,8 @@ class RandomMount(CameraDrawer):
             f"against far ones; got {', '.join(named)}. Without shift, yaw, pitch, roll and zoom are exact"
         )
 
-    def _checked_draw(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
-        return {**super()._checked_draw(draw), **{key: draw[key] for key in _DEPTHS if key in draw}}
+    def _as_numbers(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
+        return {**super()._as_numbers(draw), **{key: draw[key] for key in _DEPTHS if key in draw}}
 
     def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
         if _SHIFTS[0] not in self.ranges:

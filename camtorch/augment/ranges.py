@@ -1,4 +1,15 @@
-"""Ranges that random augmentations draw from, and draws."""
+"""Ranges that random augmentations draw from, and draws.
+
+A draw holds, by name, a row for each of B samples: `apply` (B,), whether an augmentation moves it; the numbers of each
+range, (B,) or (B, size); and what is taken from the sample, such as its `box` (B, 4), as tensors. The others have one
+of these forms:
+
+* lists, which one sample makes in the least time;
+* arrays of NumPy, of several samples, or of a draw that was given and may be read;
+* tensors where numbers may not be read, as in traced code, or have a graph, or a generator is on another device;
+* tensors of bool and float64, which `Augmentation.draw` returns. A draw that is given may hold any numbers: `apply` is
+  then true above one half, and so is the `apply` of a part of a `Compose`, whose draw is named "0.apply" and so on.
+"""
 
 from __future__ import annotations
 
@@ -82,14 +93,10 @@ def as_range(
     return Range(low, high, size)
 
 
-def draw(
+def draw_numbers(
     ranges: Mapping[str, Range], count: int, p: float, same: bool, generator: torch.Generator | None
 ) -> dict[str, Any]:
-    """Return `apply` (count,), true with probability p, and a value (count,) or (count, size) of every range.
-
-    Lists of one sample and arrays of several take less time than tensors, which come where the generator is on another
-    device, or the call is traced.
-    """
+    """Return a draw in the form that takes the least time: `apply`, true with probability p, and all ranges."""
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
     rows = min(count, 1) if same else count
@@ -118,4 +125,9 @@ def draw(
         value = low + wide * shares[start:end]
         values[name] = value.reshape(rows, interval.size) if interval.size else value
         start = end
-    return values if rows == count else {name: value[[0] * count] for name, value in values.items()}
+    return values if rows == count else rows_of(values, [0] * count)
+
+
+def rows_of(draw: Mapping[str, Any], rows: list[int] | None) -> dict[str, Any]:
+    """Return these rows of a draw of arrays or tensors; None: all."""
+    return {name: value if rows is None else value[rows] for name, value in draw.items()}

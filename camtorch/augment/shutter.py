@@ -50,6 +50,6 @@ class RandomShutter(Augmentation):
         self.direction: Direction = one_of(direction, DIRECTIONS, "direction", name)
 
     def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
-        values = self._like(source, self._values(source, draw))
+        values = self._as_tensors(source, self._values_for(source, draw))
         shutter = RollingShutter(values["readout"], torch.deg2rad(values["rates"]), direction=self.direction)
         return Part(source, ShutterWarp(source, source, target_shutter=shutter, **self.options))
