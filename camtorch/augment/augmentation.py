@@ -85,7 +85,7 @@ class Augmentation(SampleTransform):
     beside_the_camera: ClassVar[frozenset[str]] = frozenset()
     """The names of ranges that change the colours or the light of new images, not their camera."""
     keeps_lens: ClassVar[bool] = False
-    """Whether it may follow the colours and the light of a lens, though it needs the camera."""
+    """Whether it may come after a lens with chromatic aberration or vignetting in a `Compose`."""
     image_size: tuple[int, int] | None = None
     """(height, width) of new images; None: that of the images."""
     drawn_on_host: bool = False
@@ -232,6 +232,16 @@ class Augmentation(SampleTransform):
                     parts.append(replace(part, rows=samples))
         check_sizes((part.image_size for part in parts), self._name)
         return Change(count, parts, mixed=isinstance(camera, Mixed))
+
+    def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
+        """Return what parts of a `Compose` must do that this one, before `later` parts, does not; None if all is well.
+
+        name: what the text calls this part.
+        """
+        colours = self.beside_the_camera.intersection(self.ranges)
+        if colours and any(part.needs_camera and not part.keeps_lens for part in later):
+            return f"be edits after {' and '.join(sorted(colours))}, which another lens would show"
+        return None
 
     def _as_numbers(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
         """Check a draw that is given, and return it as arrays, or as tensors if numbers may not be read."""

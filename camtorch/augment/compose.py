@@ -76,35 +76,29 @@ class Compose(Augmentation):
             options.setdefault("valid_mask", True)
         super().__init__(**options)
         self.augmentations = nn.ModuleList(parts)
-        self._check_options(parts)
+        self._check_parts()
         mirrorings = {repr(m.key): m for part in parts if (m := part.mirroring) is not None}
         if len(mirrorings) > 1:
             raise ValueError(f"{name}: flips must have equal landmarks, lateral_axis and swap_sides; got others")
 
-    def _check_options(self, parts: Sequence[Augmentation]) -> None:
+    def _check_parts(self) -> None:
+        parts = self.parts
         usual = {**Augmentation().options, "mask_fill": 0.0}
         wanted = {**self.options, "mask_fill": self.mask_fill}
         for i, part in enumerate(parts):
-            given = {**part.options, "mask_fill": part.mask_fill}
+            kind, given = type(part).__name__, {**part.options, "mask_fill": part.mask_fill}
             for key in ("mode", "padding_mode", "fill", "tolerance", "mask_fill"):
                 if given[key] not in (usual[key], wanted[key]):
                     raise ValueError(
                         f"{self._name}: images are sampled once, so parts must have one {key}; got {given[key]!r} of "
-                        f"{type(part).__name__}. Pass it to {self._name} itself"
+                        f"{kind}. Pass it to {self._name} itself"
                     )
-            drawn, later = {key.rpartition(".")[2] for key in part.ranges}, parts[i + 1 :]
-            coloured = {"chromatic", "vignetting", "cos4"} & drawn
-            kind = type(part).__name__
-            for wrong, reason in (
-                ("shift_x" in drawn, f"have no shift, which needs depth: {kind} goes before"),
-                ("rates" in drawn and later, f"move no rows of a rolling shutter: {kind} goes last"),
-                (
-                    coloured and any(one.needs_camera and not one.keeps_lens for one in later),
-                    f"be edits after {' and '.join(sorted(coloured))}, which another lens would show",
-                ),
-            ):
-                if wrong:
-                    raise ValueError(f"{self._name}: parts must {reason}; got {kind} at place {i}")
+            if error := part._chain_error(parts[i + 1 :], kind):
+                raise ValueError(f"{self._name}: parts must {error}; got {kind} at place {i}")
+
+    def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
+        errors = (part._chain_error(later, name) for part in reversed(self.parts))
+        return next(filter(None, errors), None)
 
     @property  # type: ignore[override]
     def ranges(self) -> Mapping[str, Range]:
@@ -168,22 +162,22 @@ class Compose(Augmentation):
             part.tell_of_empty_images(camera)
 
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
-        total, options = None, {**self.options, "antialias": self.antialias}
-        steps = []
-        for i, part in enumerate(self.parts):
-            own = {name: draw[f"{i}.{name}"] for name in ("apply", *part.ranges, *part.crops)}
-            steps.append((part, {**own, "apply": (own["apply"] > 0.5) & draw["apply"]}))
-        while steps:
-            edits = []
-            while steps and isinstance(steps[0][0], Edit):  # consecutive edits are one
-                edits.append(cast("tuple[Edit, dict[str, Any]]", steps.pop(0)))
-            if edits:
-                step = change_by(edits, camera, options)
+        options = {**self.options, "antialias": self.antialias}
+        parts = self.parts
+        total: Change | None = None  # of the parts so far; camera: that after them
+        edits: list[tuple[Edit, Mapping[str, Any]]] = []
+        for i, part in enumerate(parts):
+            part_draw = {name: draw[f"{i}.{name}"] for name in ("apply", *part.ranges, *part.crops)}
+            part_draw["apply"] = (part_draw["apply"] > 0.5) & draw["apply"]
+            if isinstance(part, Edit):
+                edits.append((part, part_draw))
+                if i + 1 < len(parts) and isinstance(parts[i + 1], Edit):
+                    continue  # consecutive edits are one
+                step, edits = change_by(edits, camera, options), []
             else:
-                part, own = steps.pop(0)
                 if total is not None:
-                    own |= {name: _moved(total, own[name], camera) for name in part.crops}
-                step = part._change(camera, own)
+                    part_draw |= {name: _moved(total, part_draw[name], camera) for name in part.crops}
+                step = part._change(camera, part_draw)
             total = step if total is None else total.then(step)
             (first, *others) = step.parts  # a camera of all samples stays single
             camera = step.target if others or first.rows is not None else first.target

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
+from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.change import Part
 from camtorch.augment.drawer import Auto, CameraDrawer, LensOptions
 from camtorch.augment.fields import Named
@@ -153,6 +154,11 @@ class RandomMount(CameraDrawer):
 
     def _as_numbers(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
         return {**super()._as_numbers(draw), **{key: draw[key] for key in _DEPTHS if key in draw}}
+
+    def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
+        if _SHIFTS[0] in self.ranges:
+            return f"have no shift, which needs depth: {name} goes before"
+        return super()._chain_error(later, name)
 
     def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
         if _SHIFTS[0] not in self.ranges:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -48,6 +48,9 @@ class RandomShutter(Augmentation):
         }
         super().__init__(ranges, min_filled=0, **options)  # only the rim may be empty
         self.direction: Direction = one_of(direction, DIRECTIONS, "direction", name)
+
+    def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
+        return f"move no rows of a rolling shutter: {name} goes last" if later else None
 
     def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._as_tensors(source, self._values_for(source, draw))
