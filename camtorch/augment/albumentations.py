@@ -21,13 +21,14 @@ from torch import nn
 from camtorch import augment
 from camtorch.augment import numpy as arrays
 from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.cameras import Unknown, camera_of_sample
 from camtorch.augment.fields import KINDS
-from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
+from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.landmarks import Mirroring, Table
 from camtorch.augment.matrices import NAMES
 from camtorch.augment.names import kind_of
 from camtorch.augment.ranges import Range
-from camtorch.augment.sample import Calls, Sample, Unknown, detached
+from camtorch.augment.sample import Calls, Sample, detached
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.values.arguments import shown

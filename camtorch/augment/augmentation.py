@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
+from camtorch.augment.cameras import known_camera
 from camtorch.augment.change import Change, Part, by_kinds, check_sizes, one_or_batch
 from camtorch.augment.devices import Elsewhere, remember_camera, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
@@ -358,9 +359,8 @@ class Augmentation(SampleTransform):
         """
         sample = self._given(sample, fields)
         if clips := self._clips(sample):
-            own = sample.get("camera")
-            own = self.camera if own is None else own
-            frames = clips.frames(one_or_batch(own) if isinstance(own, Camera) else own)
+            camera = known_camera(sample.get("camera"), self.camera)
+            frames = clips.frames(one_or_batch(camera) if isinstance(camera, Camera) else camera)
             drawn = self.drawn(clips.shape[0], self.p, self.same_on_batch, generator) if draw is None else draw
             each = clips.shape[1]  # a draw takes the boxes that it needs from the first frame
             first = {n: (kind, value[::each]) for n, (kind, value) in moving(frames, self.fields, self._name).items()}

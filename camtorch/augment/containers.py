@@ -23,8 +23,7 @@ from camtorch import augment
 from camtorch.augment.fields import OWN
 from camtorch.augment.front_end import FrontEnd
 from camtorch.augment.kornia_parts import BasicAugmentationBase, ParamItem
-from camtorch.augment.matrices import Guess
-from camtorch.augment.matrices import camera_of as camera_by
+from camtorch.augment.matrices import Guess, pinhole_of_matrix
 from camtorch.augment.names import is_text, kind_of
 from camtorch.augment.sample import Sample, Single, detached, on_samples
 from camtorch.cameras.camera import Camera
@@ -107,7 +106,7 @@ def _parts(params: Any, module: nn.Module | None = None) -> Iterator[tuple[nn.Mo
             yield from _parts(item.data, None if module is None else module.get_submodule(item.name))
 
 
-def camera_of(params: Params, own: Camera, device: torch.device | None) -> Camera:
+def camera_with_params(params: Params, own: Camera, device: torch.device | None) -> Camera:
     """Return the camera with the numbers that the params carry, by default those of `own`."""
     given = own.intrinsics, own.distortion
     device = own.intrinsics.device if device is None else device
@@ -176,7 +175,7 @@ def _with_fields(
     matrix = None  # the camera of a field K
     if name is not None and camera is None and image is not None and all(isinstance(o.camera, Guess) for o in ours):
         value = fields[name].flatten(0, -3) if fields[name].ndim > 3 else fields[name]  # of the frames of videos
-        matrix = camera_by(name, value, (image.shape[-2], image.shape[-1]), type(self).__name__)
+        matrix = pinhole_of_matrix(name, value, (image.shape[-2], image.shape[-1]), type(self).__name__)
     given = matrix if camera is None else camera
     if given is not None and len(ours) > 1:
         raise ValueError(

@@ -23,9 +23,10 @@ from torch import Tensor
 
 from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.cameras import check_single
 from camtorch.augment.change import Change, Part
-from camtorch.augment.containers import KIND, Params, camera_of, kind_of_camera, with_boxes, with_cameras
-from camtorch.augment.front_end import FrontEnd, check_front_end, check_single
+from camtorch.augment.containers import KIND, Params, camera_with_params, kind_of_camera, with_boxes, with_cameras
+from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.kornia_parts import input_metadata_only, transform_output_shape
 from camtorch.augment.matrices import Guess
 from camtorch.augment.sample import detached, on_samples
@@ -120,7 +121,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
 
     def camera_for(self, size: Sequence[int]) -> Camera:
         """Return the camera of images of a size (height, width)."""
-        return self.camera.camera((int(size[0]), int(size[1]))) if isinstance(self.camera, Guess) else self.camera
+        return self.camera.pinhole_for((int(size[0]), int(size[1]))) if isinstance(self.camera, Guess) else self.camera
 
     def set_rng_device_and_dtype(self, device: torch.device, dtype: torch.dtype) -> None:
         """Keep draws on the CPU: a seed then draws the same on every device, and reading params needs no wait."""
@@ -158,7 +159,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
             own = self.camera_for(
                 (params[KIND][0] if len(params[KIND]) else params["forward_input_shape"])[-2:].tolist()
             )
-        camera = camera_of(params, own, device)
+        camera = camera_with_params(params, own, device)
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
         inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
         parts = [vars(part) for part in self.augmentation.modules()]

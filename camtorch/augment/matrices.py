@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 class Guess(float):
-    """Degrees across of the pinhole camera that stands in for the unknown one of photographs, of any size."""
+    """A number given as camera=: degrees across of the pinhole that stands in for the unknown camera of photographs."""
 
     @classmethod
     def instead(cls, camera: Any, owner: str) -> Any:
@@ -48,7 +48,7 @@ class Guess(float):
         check_degrees(degrees, camera, owner)
         return cls(degrees)
 
-    def camera(self, size: tuple[int, int]) -> Pinhole:
+    def pinhole_for(self, size: tuple[int, int]) -> Pinhole:
         """Return the camera of images of a size (height, width), one for all of them."""
         known = _guessed.__wrapped__ if torch.compiler.is_compiling() else _guessed
         return known(float(self), (int(size[0]), int(size[1])))
@@ -109,7 +109,7 @@ def numbers_of(matrix: Tensor) -> Tensor:
     return torch.stack((wide[..., 0, 0], wide[..., 1, 1], wide[..., 0, 2], wide[..., 1, 2]), -1)
 
 
-def camera_of(name: str, matrix: Tensor | list[Tensor], size: tuple[int, int], owner: str) -> Pinhole:
+def pinhole_of_matrix(name: str, matrix: Tensor | list[Tensor], size: tuple[int, int], owner: str) -> Pinhole:
     """Return the camera of images of a size (height, width) with a matrix, a batch or a list; gradients reach it."""
     rows = matrix if isinstance(matrix, list) else [matrix]
     for row in rows:

@@ -11,22 +11,22 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Self
 
+from camtorch.augment.cameras import Unknown, camera_of_images
 from camtorch.augment.change import Change, one_or_batch
 from camtorch.augment.clips import Clips
 from camtorch.augment.devices import remember_camera
-from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS, Named
+from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS
 from camtorch.augment.keywords import check_arguments
 from camtorch.augment.landmarks import Mirroring
-from camtorch.augment.matrices import Guess, camera_of, check_agrees, check_targets, refuse
+from camtorch.augment.matrices import Guess, check_agrees, check_targets, refuse
 from camtorch.augment.plan import Batch, SamplePlan, form_of, move
-from camtorch.augment.reading import check_cameras, check_fields, check_one_size, is_batch, moving
+from camtorch.augment.reading import check_cameras, check_fields, is_batch, moving
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_free, in_worker, is_unknown
-from camtorch.models import Pinhole
 from camtorch.native.library import warn_if_missing
-from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_number, check_devices, no_camera
+from camtorch.values.arguments import as_flag, as_mapping, as_number, check_devices, no_camera
 from camtorch.values.module import GeometryModule
 from camtorch.values.threads import on_one_thread
 from camtorch.warp.options import Options, as_options
@@ -44,14 +44,6 @@ class Single(dict[str, Any]):
 
 class Frames(Single):
     """A single sample whose values may have leading dims, as those of clips have: all of them move by one change."""
-
-
-class Unknown(Pinhole):
-    """The camera of images of which only the size is known, while they are edited; no sample comes out with it."""
-
-    @classmethod
-    def of(cls, size: tuple[int, int]) -> Unknown:
-        return cls(torch.tensor([1.0, 1.0, 0.0, 0.0]), image_size=size).requires_grad_(False)
 
 
 class KeepsCamera:
@@ -220,14 +212,12 @@ class SampleTransform(KeepsCamera, nn.Module):
         camera: instead of the sample's. predicted: values may be bad. kinds: name -> kind, in addition to `fields`.
         """
         camera = sample.get("camera") if camera is None else camera
-        if camera is None and (camera := self._modules.get("camera")) is None:  # where torch looks last
-            camera = self.camera
         fields = {**self.fields, **kinds} if kinds else self.fields
-        if isinstance(camera, Guess) and isinstance(self.camera, Camera):  # a front end has brought the number
-            camera = self.camera
-        elif camera is None or isinstance(camera, Guess):
-            named = moving(sample, fields, self._name)
-            camera = camera_of_images(named, camera, self.needs_camera, self._name)
+        if camera is None or isinstance(camera, Guess):  # what `known_camera` says, without a call
+            guess, camera = camera or vars(self).get("camera"), self._modules.get("camera")
+            if camera is None:
+                named = moving(sample, fields, self._name)
+                camera = camera_of_images(named, guess, self.needs_camera, self._name)
         form = form_of(sample, camera, fields, self._calls.revision)
         if form is not None and (known := self._calls.plans.entry((), form)) is not None:
             plan: SamplePlan = known[2]
@@ -371,33 +361,6 @@ class SampleTransform(KeepsCamera, nn.Module):
             return seen
         whole = change.valid_mask()
         return whole if seen is None else seen & (whole if seen.ndim == 4 else whole[:, 0])
-
-
-def camera_of_images(named: Named, guess: Guess | None, is_needed: bool, owner: str) -> Camera:
-    """Return a camera if neither the sample nor the augmentation has one: from the sample's K, guessed, or unknown."""
-    how = f"give one as sample['camera'] or {owner}(camera=...)"
-    matrix = next(((name, value) for name, (kind, value) in named.items() if kind == "K"), None)
-    if is_needed and guess is None and matrix is None:
-        guessed = f"camera=60, degrees across, takes pinholes for photographs of unknown cameras; {GUESS_CAMERA}"
-        raise ValueError(f"{owner}: the sample must have a camera; got none. Please {how}. {guessed}")
-    for name, (kind, value) in named.items():
-        items = value if isinstance(value, list) else [value]
-        shape: Sequence[int] = items[0].shape if items else ()
-        if kind == "image" and len(shape) > 2 and shape[-1] <= 4 < shape[-3]:
-            raise ValueError(
-                f"{owner}: {name} must have its channels first, (B, C, H, W); got {tuple(shape)}, which seems to have "
-                f"them last. camtorch.augment.numpy takes arrays as they are; if they are first, {how}"
-            )
-        if kind in IMAGES:
-            check_one_size(name, {(one.shape[-2], one.shape[-1]) for one in items}, owner)
-            size = shape[-2], shape[-1]
-            if matrix is not None:
-                return camera_of(*matrix, size, owner)
-            return Unknown.of(size) if guess is None else guess.camera(size)
-    raise ValueError(
-        f"{owner}: the sample must have an image or a camera, as labels move by the image's size; got "
-        f"{', '.join(named)}. For a camera, {how}"
-    )
 
 
 def still_valid(name: str, valid: Any, given: Any, owner: str) -> Any:

@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation
+from camtorch.augment.cameras import camera_of_sample, known_camera
 from camtorch.augment.change import Change
 from camtorch.augment.fields import IMAGES, KEEP, KINDS, OWN, PLACE
-from camtorch.augment.front_end import FrontEnd, camera_of_sample, check_front_end
+from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.matrices import Guess
 from camtorch.augment.names import kind_of, pattern_of
 from camtorch.augment.reading import as_tensor
@@ -120,11 +121,12 @@ class Transform(FrontEnd, v2.Transform):
             raise ValueError(f"{_OWNER}: a sample must have one camera; got {len(cameras)}")
         own = self.augmentation
         matrix = next(((keys[i], value) for i, (kind, value, _) in fields.items() if kind == "K"), None)
-        camera = camera_of_sample(_OWNER, own, leaves[cameras[0]] if cameras else self.camera, sizes, matrix)
+        given_camera = leaves[cameras[0]] if cameras else self.camera
+        camera = camera_of_sample(_OWNER, own, given_camera, sizes, matrix)
         kinds = {keys[i]: kind or KEEP for i, (kind, _, _) in fields.items()}
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
         sample = Frames({keys[i]: value for i, (_, value, _) in fields.items()}, camera=detached(camera))
-        guessed = matrix is None and isinstance(self.camera or own.camera, Guess) and not isinstance(own.camera, Camera)
+        guessed = matrix is None and isinstance(known_camera(given_camera, own.camera), Guess)
 
         def write(moved: Sample, change: Change) -> Any:
             for i, (kind, _, back) in fields.items():
@@ -135,7 +137,7 @@ class Transform(FrontEnd, v2.Transform):
             result = pytree.tree_unflatten(leaves, spec)
             if own.place and isinstance(result, dict):
                 result[PLACE] = moved[PLACE]
-            if guessed and not cameras and isinstance(result, dict):
+            if guessed and isinstance(result, dict):
                 result["camera"] = moved["camera"]
             for i in fields if self.valid else ():
                 path, valid = paths[i], moved.get(f"{keys[i]}_valid")
