@@ -9,35 +9,28 @@ The module is imported by name: `import camtorch.augment.albumentations`. Withou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import albumentations as A  # noqa: N812 (everybody's name for it)
 import numpy as np
 import torch
 from albumentations.core.type_definitions import Targets
-from torch import nn
 
-from camtorch import augment
 from camtorch.augment import numpy as arrays
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import Unknown, camera_of_sample
 from camtorch.augment.fields import KINDS
 from camtorch.augment.front_end import FrontEnd, check_front_end
-from camtorch.augment.landmarks import Mirroring, Table
 from camtorch.augment.matrices import NAMES
 from camtorch.augment.names import kind_of
-from camtorch.augment.ranges import Range
-from camtorch.augment.sample import Calls, Sample, detached
+from camtorch.augment.sample import Sample, detached
+from camtorch.augment.saving import as_plain, from_plain
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.kept import Kept
-from camtorch.values.arguments import shown
 
 _OWNER = "albumentations.Transform"
-_OWN = "image", "images", "mask", "masks", "bboxes", "keypoints"  # targets of pipelines
-_CLASS = "__class__"  # the key of a saved value's class
-_KINDS: tuple[Any, ...] = tuple, dict, nn.ModuleList, Range, Mirroring, Table, Kept  # of saved values
-_OF_MODULES = nn.Module().__dict__
+_TARGETS = "image", "images", "mask", "masks", "bboxes", "keypoints"  # of pipelines
+_MAY_BE_EMPTY = "bboxes", "keypoints"  # which an image without objects has none of
 
 
 class Transform(FrontEnd, A.DualTransform):
@@ -78,7 +71,7 @@ class Transform(FrontEnd, A.DualTransform):
     _name = _OWNER
 
     def __init__(self, augmentation: Augmentation, camera: Camera | float | None = None, p: float | None = None):
-        augmentation, camera = _made(augmentation), _made(camera)  # as of `A.load`
+        augmentation, camera = from_plain(augmentation, _OWNER), from_plain(camera, _OWNER)  # as of `A.load`
         check_front_end(_OWNER, augmentation)
         self.augmentation, self.camera, self._arrays = augmentation, camera, arrays.Transform(augmentation)
         super().__init__(p=augmentation.p if p is None else p)
@@ -86,10 +79,10 @@ class Transform(FrontEnd, A.DualTransform):
     @property
     def targets(self) -> dict[str, Callable[..., Any]]:
         nothing: Callable[..., Any] = self.apply  # `apply_with_params` moves all targets together
-        return dict.fromkeys((*KINDS, *_OWN, *NAMES, *self.augmentation.fields, "camera"), nothing)
+        return dict.fromkeys((*KINDS, *_TARGETS, *NAMES, *self.augmentation.fields, "camera"), nothing)
 
     def to_dict_private(self) -> dict[str, Any]:
-        parts = {name: _plain(getattr(self, name), f"{_OWNER}: {name}") for name in ("augmentation", "camera")}
+        parts = {name: as_plain(getattr(self, name), f"{_OWNER}: {name}") for name in ("augmentation", "camera")}
         return {"__class_fullname__": self.get_class_fullname(), "p": self.p, **parts}
 
     def get_dict_with_id(self) -> dict[str, Any]:  # for a replay, which makes the transform of these values again
@@ -116,10 +109,12 @@ class Transform(FrontEnd, A.DualTransform):
         fields = {} if isinstance(camera, Unknown) else {"camera": camera}
         for i, (name, value) in enumerate(data.items()):
             target = self._additional_targets.get(name, name)
-            own = name in ("camera", "applied_transforms", self.save_key) or value is None
-            if not own and not (target in _OWN[4:] and len(value) == 0):  # a name that begins with a kind is known
-                field = name if name == target else f"{kind_of(target, value, {}, _OWNER)}_{i}"
-                places[field], fields[field] = (name, target), _given(target, value, camera)
+            stays = value is None or name in ("camera", "applied_transforms", self.save_key)
+            if stays or (target in _MAY_BE_EMPTY and len(value) == 0):
+                continue
+            # a name that begins with a kind is known
+            field = name if name == target else f"{kind_of(target, value, {}, _OWNER)}_{i}"
+            places[field], fields[field] = (name, target), _given(target, value, camera)
 
         def write(moved: Sample) -> Sample:
             change = self.augmentation.last
@@ -128,87 +123,23 @@ class Transform(FrontEnd, A.DualTransform):
             for field, (name, target) in places.items():
                 seen = moved.get(f"{field}_valid")
                 result[name] = _taken(target, data[name], moved[field], seen, change.parts[0].image_size)
-                if seen is not None and target not in _OWN:
+                if seen is not None and target not in _TARGETS:
                     result[f"{name}_valid"] = seen
             return result
 
         return fields, write
 
     def _source(self, data: dict[str, Any]) -> Camera:
+        """Return the camera of a sample's images."""
         sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]
-        given = data.get("camera")
+        given = self.camera if data.get("camera") is None else data["camera"]
         matrices = ((name, value) for name, value in data.items() if value is not None and self._is_matrix(name, value))
-        camera = self.camera if given is None else given
-        return camera_of_sample(_OWNER, self.augmentation, camera, sizes, next(matrices, None))
+        return camera_of_sample(_OWNER, self.augmentation, given, sizes, next(matrices, None))
 
     def _is_matrix(self, name: str, value: Any) -> bool:
         name = self._additional_targets.get(name, name)
         kinds = self.augmentation.fields
         return (name in NAMES or "K" in kinds.values()) and kind_of(name, value, kinds, _OWNER, single=True) == "K"
-
-
-def _plain(value: Any, name: str) -> Any:
-    """Return numbers, strings, lists and dicts, of which `_made` makes `value` again."""
-    for plain in (bool, int, float, str):
-        if isinstance(value, plain):
-            return plain(value)
-    if isinstance(value, Camera):
-        return {_CLASS: "Camera", **value.to_dict()}
-    kind = next((kind for kind in _KINDS if isinstance(value, kind)), None)
-    if isinstance(value, list) or kind in _KINDS[:3]:
-        items = map(list, value.items()) if kind is dict else value  # YAML sorts dicts, and ranges have an order
-        values = [_plain(one, f"{name}[{i}]") for i, one in enumerate(items)]
-        return values if kind is None else {_CLASS: kind.__name__, "values": values}
-    if isinstance(value, Augmentation):
-        state = {n: v for n, v in vars(value).items() if n not in _OF_MODULES and not isinstance(v, Calls)}
-        state |= value._modules | value._parameters | value._buffers
-    elif value is None:
-        return None
-    elif kind is None:
-        must = "numbers, strings, cameras, or lists or dicts of them, to be saved"
-        raise TypeError(f"{name} must be {must}; got {shown(value)}. Pickle the pipeline instead")
-    else:
-        state = value.__getstate__()
-    return {_CLASS: _name_of(type(value)), **{key: _plain(one, f"{name}.{key}") for key, one in state.items()}}
-
-
-def _made(value: Any) -> Any:
-    """Return the value that `_plain` was given, and other values unchanged."""
-    if isinstance(value, list):
-        return [_made(one) for one in value]
-    if not isinstance(value, Mapping):
-        return value
-    state = {key: _made(one) for key, one in value.items()}
-    if (name := state.pop(_CLASS, "Camera")) == "Camera":
-        return Camera.from_dict(state)
-    kinds = {_name_of(kind): kind for kind in (*_KINDS, *_augmentations(Augmentation))}
-    if name not in kinds:
-        raise ValueError(f"{_OWNER}: an augmentation's class must be imported before A.load; got {name!r}")
-    if "values" in state:
-        return kinds[name](state["values"])
-    made: Any = kinds[name].__new__(kinds[name])
-    if not isinstance(made, Augmentation):
-        made.__dict__.update(state)
-        return made
-    nn.Module.__init__(made)
-    parts = {key: one for key, one in state.items() if key == "camera" or isinstance(one, nn.Module)}
-    made.__setstate__({**vars(made), **{key: one for key, one in state.items() if key not in parts}})
-    for key, one in parts.items():
-        setattr(made, key, one)
-    return made
-
-
-def _augmentations(kind: type[Augmentation]) -> Iterator[type[Augmentation]]:
-    """Yield a class and those that are made of it."""
-    yield kind
-    for own in kind.__subclasses__():
-        yield from _augmentations(own)
-
-
-def _name_of(kind: type) -> str:
-    """Return the name of a class of camtorch, and the full name of an augmentation by somebody else."""
-    known = kind in _KINDS or getattr(augment, kind.__name__, None) is kind
-    return kind.__name__ if known else f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _given(target: str, value: Any, camera: Camera) -> Any:
