@@ -1,7 +1,10 @@
 """kornia's containers of camera augmentations: dicts move whole, and params carry cameras and boxes of the samples.
 
-kornia passes on fields of a dict that it does not know without a warning. So this module wraps `forward` and `inverse`
-of its containers, how they take boxes, and how they are copied.
+In containers that hold one of them, this module wraps methods of kornia's:
+
+* `forward` and `inverse`, since fields of a dict that kornia does not know would stay as they are, without a warning;
+* `_preproc_boxes`, since kornia takes no boxes of zeros, which it makes of those that are lost;
+* `__getstate__`, since params of a graph could be neither copied nor pickled.
 """
 
 from __future__ import annotations
@@ -9,7 +12,7 @@ from __future__ import annotations
 import functools
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from kornia.augmentation import AugmentationSequential, IntensityAugmentationBase2D
@@ -20,6 +23,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch import augment
+from camtorch.augment.change import Change
 from camtorch.augment.fields import OWN
 from camtorch.augment.front_end import FrontEnd
 from camtorch.augment.kornia_parts import BasicAugmentationBase, ParamItem
@@ -97,7 +101,7 @@ def _edited(params: Any, name: str, need: str) -> tuple[Any, list[tuple[Params, 
     return result, found
 
 
-def _parts(params: Any, module: nn.Module | None = None) -> Iterator[tuple[nn.Module | None, Params]]:
+def _parts(params: Any, module: nn.Module | None = None) -> Iterator[tuple[Any, Params]]:
     """Yield the params of single augmentations, in order, with the augmentation if they are those of `module`."""
     if isinstance(params, dict):
         yield module, params
@@ -126,23 +130,70 @@ def kind_of_camera(camera: Camera) -> list[int]:
     return [_CODES[model], camera.distortion.shape[-1], *(camera.image_size or (0, 0))]
 
 
-def _fields(container: Any, sample: Sample, ours: list[FrontEnd], single: bool) -> tuple[Sample, dict[str, str]]:
-    """Return the fields of a dict that kornia does not know and that move, and their kinds."""
-    owner, own = type(container).__name__, {n: k for one in ours for n, k in one.augmentation.fields.items()}
-    tables = {n for one in ours if one.augmentation.mirroring for n in one.augmentation.mirroring.by_name}
-    theirs = {name: container._read_datakeys_from_dict((name,))[0] for name in sample if name not in OWN}
-    given = {name: sample[name] for name, keys in theirs.items() if keys in ([], [DataKey.CLASS], [DataKey.LABEL])}
-    if flags := [name for name in sample if name.endswith("_valid") and name not in given]:
+class _Dict(NamedTuple):
+    """The dict of a call of a container, read."""
+
+    texts: Sample  # values that are strings: image_path is no image
+    rest: Sample  # the others, which the container gets
+    fields: Sample  # of them, those that move and that kornia does not know; a `Single` if the image has no dim B
+    kinds: dict[str, str]  # of these fields, but for flags and orders of landmarks
+    image: Tensor | None
+    camera: Any
+
+
+def _read_dict(container: Any, given: Sample, ours: list[FrontEnd]) -> _Dict:
+    owner, texts = type(container).__name__, {name: value for name, value in given.items() if is_text(value)}
+    rest = {name: value for name, value in given.items() if name not in texts}
+    keys = {name: container._read_datakeys_from_dict((name,))[0] for name in rest}
+    unknown = [n for n, own in keys.items() if n not in OWN and own in ([], [DataKey.CLASS], [DataKey.LABEL])]
+    if flags := [name for name in rest if name.endswith("_valid") and name not in unknown]:
         raise ValueError(f"{owner}: a flag must be no kornia key; got {flags[0]}. Use its own keypoints_valid")
-    kinds = {n: kind for n, v in given.items() if v is not None and (kind := kind_of(n, v, own, owner, single))}
-    names = [*kinds, *(["camera"] if sample.get("camera") is not None else [])]
+    image = next((rest[name] for name, own in keys.items() if own == [DataKey.INPUT]), None)
+    is_single = image is not None and image.ndim < 4
+    named = {name: kind for one in ours for name, kind in one.augmentation.fields.items()}
+    filled = {name: rest[name] for name in unknown if rest[name] is not None}
+    kinds = {n: kind for n, value in filled.items() if (kind := kind_of(n, value, named, owner, is_single))}
+    _check_others(container, [*kinds, *(["camera"] if rest.get("camera") is not None else [])])
+    tables = {n for one in ours if one.augmentation.mirroring for n in one.augmentation.mirroring.by_name}
+    fields = {n: rest[n] for n in unknown if n in kinds or n.removesuffix("_valid") in kinds or n in tables}
+    return _Dict(texts, rest, Single(fields) if is_single else fields, kinds, image, given.get("camera"))
+
+
+def _check_others(container: Any, names: list[str]) -> None:
+    """Raise a ValueError if the container holds augmentations of kornia's own that would leave fields unmoved."""
     known = FrontEnd, IntensityAugmentationBase2D
     others = (m for m in container.modules() if isinstance(m, BasicAugmentationBase) and not isinstance(m, known))
     for other in (type(module).__name__ for module in others if names):
         name = next((name for name in (other, other.removeprefix("Random")) if hasattr(augment, name)), None)
         how = f"camtorch.augment.kornia.{name}, which moves" if name else "augmentations of camtorch alone, which move"
-        raise ValueError(f"{owner}: parts must move {', '.join(names)} too; got kornia's {other}. Use {how} everything")
-    return {n: v for n, v in given.items() if n in kinds or n.removesuffix("_valid") in kinds or n in tables}, kinds
+        raise ValueError(
+            f"{type(container).__name__}: parts must move {', '.join(names)} too; got kornia's {other}. Use {how} "
+            "everything"
+        )
+
+
+def _given_camera(container: Any, read: _Dict, ours: list[FrontEnd]) -> Any:
+    """Return the camera of a dict, else that of its field K if no camera is known; None if it brings none."""
+    camera, image, owner = read.camera, read.image, type(container).__name__
+    name = next((name for name, kind in read.kinds.items() if kind == "K"), None)
+    if camera is None and name and image is not None and all(isinstance(one.camera, Guess) for one in ours):
+        value = read.fields[name]
+        value = value.flatten(0, -3) if value.ndim > 3 else value  # of the frames of videos
+        camera = pinhole_of_matrix(name, value, (image.shape[-2], image.shape[-1]), owner)
+    if camera is not None and len(ours) > 1:
+        raise ValueError(
+            f"{owner}: a camera must be that of one camera augmentation; got {len(ours)}. "
+            "camtorch.augment.kornia.Compose makes one of several"
+        )
+    return camera
+
+
+def _params_for(container: Any, camera: Any, image: Tensor | None, params: Any) -> Any:
+    """Return params with the numbers of cameras; without any, drawn for the image."""
+    if params is None and image is not None:
+        dims = (3, 5) if container.contains_video_sequential else (2, 4)
+        params = container.forward_parameters(container.autofill_dim(image, dim_range=dims)[1])
+    return with_cameras(params, camera)
 
 
 @on_samples
@@ -165,43 +216,23 @@ def _with_fields(
     if len(args) != 1 or not isinstance(args[0], dict):
         return call(self, *args, params=params, data_keys=data_keys)
     ours = [one for one in self.modules() if isinstance(one, FrontEnd)]
-    texts = {name: value for name, value in args[0].items() if is_text(value)}  # image_path is no image
-    sample, camera = {n: value for n, value in args[0].items() if n not in texts}, args[0].get("camera")
-    image = next((v for n, v in sample.items() if self._read_datakeys_from_dict((n,))[0] == [DataKey.INPUT]), None)
-    alone = image is not None and image.ndim < 4
-    fields, kinds = _fields(self, sample, ours, alone)
-    fields = Single(fields) if alone else fields
-    name = next((n for n, kind in kinds.items() if kind == "K"), None)
-    matrix = None  # the camera of a field K
-    if name is not None and camera is None and image is not None and all(isinstance(o.camera, Guess) for o in ours):
-        value = fields[name].flatten(0, -3) if fields[name].ndim > 3 else fields[name]  # of the frames of videos
-        matrix = pinhole_of_matrix(name, value, (image.shape[-2], image.shape[-1]), type(self).__name__)
-    given = matrix if camera is None else camera
-    if given is not None and len(ours) > 1:
-        raise ValueError(
-            f"{type(self).__name__}: a camera must be that of one camera augmentation; got {len(ours)}. "
-            "camtorch.augment.kornia.Compose makes one of several"
-        )
-    if given is not None and not back:
-        if params is None and image is not None:
-            dims = (3, 5) if self.contains_video_sequential else (2, 4)
-            params = self.forward_parameters(self.autofill_dim(image, dim_range=dims)[1])
-        params = with_cameras(params, given)
-    result = call(self, sample, params=params)
-    applied = [*_parts(self._params if params is None else params, self)]
-    for one, own in reversed(applied) if back else applied:
-        if not isinstance(one, FrontEnd):
-            continue
-        fields = _moved(one, fields, own, kinds, back) if kinds else fields
-        if camera is not None:
-            cameras = one.change(own).source if back else one.change(own).target
-            cameras = (cameras[0] if alone else cameras).clone()
-            result["camera"] = list(cameras) if isinstance(camera, list) else cameras
-    return {**result, **fields, **texts}
+    read = _read_dict(self, args[0], ours)
+    if (camera := _given_camera(self, read, ours)) is not None and not back:
+        params = _params_for(self, camera, read.image, params)
+    result, fields = call(self, read.rest, params=params), read.fields
+    applied = [pair for pair in _parts(self._params if params is None else params, self) if pair[0] in ours]
+    for part, own in reversed(applied) if back else applied:
+        fields = _moved(part, fields, own, read.kinds, back) if read.kinds else fields
+        if read.camera is not None:
+            change: Change = part.change(own)
+            cameras = change.source if back else change.target
+            cameras = (cameras[0] if isinstance(read.fields, Single) else cameras).clone()
+            result["camera"] = list(cameras) if isinstance(read.camera, list) else cameras
+    return {**result, **fields, **read.texts}
 
 
 def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: DataKey) -> Boxes:
-    """Treat boxes of zeros, as kornia exports lost ones, as lost, since kornia takes no box without a width."""
+    """Read boxes of zeros as lost: kornia exports lost boxes so, and refuses them as input."""
     if not isinstance(boxes, Tensor):
         return call(self, boxes, key)
     lost = (boxes == 0).all(-1) if key is not DataKey.BBOX else (boxes == 0).all(-1).all(-1)
