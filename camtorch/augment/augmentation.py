@@ -203,6 +203,12 @@ class Augmentation(SampleTransform):
             return self._change(camera, draw)
         return Elsewhere(self._change(twin, draw), camera.intrinsics.device)
 
+    def _state_key(self) -> tuple[Any, ...]:
+        """Return what, but for tensors, changes follow from: another key if anything of it or of its parts was set."""
+        states = [vars(part) for part in self.modules()]
+        revisions = [getattr(state.get("_calls"), "revision", None) for state in states]  # with public attributes
+        return *revisions, str([[state.get(name) for name in ("options", "ranges", "image_size")] for state in states])
+
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         """Return the change of a draw of any form."""
         if 0 < self.p < 1 and self.image_size not in (None, camera.image_size):

@@ -110,7 +110,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
             self._set_size(check_single(name, camera, (), ". with_cameras gives every sample its own"))
         self.keypoints_valid: Tensor | None = None
         """(B, N) bool: whether the keypoints that were moved last lie on their image."""
-        # two memos: lists of masks are moved row by row between other labels of the batch
+        # of a row and of a batch: kornia moves lists of masks row by row, between labels of the whole batch
         self._memos = Kept(), Kept()
 
     def _set_size(self, own_size: tuple[int, int]) -> None:
@@ -121,7 +121,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
 
     def camera_for(self, size: Sequence[int]) -> Camera:
         """Return the camera of images of a size (height, width)."""
-        return self.camera.pinhole_for((int(size[0]), int(size[1]))) if isinstance(self.camera, Guess) else self.camera
+        return self.camera.pinhole_for((size[0], size[1])) if isinstance(self.camera, Guess) else self.camera
 
     def set_rng_device_and_dtype(self, device: torch.device, dtype: torch.dtype) -> None:
         """Keep draws on the CPU: a seed then draws the same on every device, and reading params needs no wait."""
@@ -156,18 +156,14 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
             )
         own = self.camera
         if isinstance(own, Guess):
-            own = self.camera_for(
-                (params[KIND][0] if len(params[KIND]) else params["forward_input_shape"])[-2:].tolist()
-            )
+            size = (params[KIND][0] if len(params[KIND]) else params["forward_input_shape"])[-2:]
+            own = self.camera_for(size.tolist())
         camera = camera_with_params(params, own, device)
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
         inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
-        parts = [vars(part) for part in self.augmentation.modules()]
-        state = [
-            (getattr(own.get("_calls"), "revision", None), str(own.get("options")), own.get("image_size"))
-            for own in parts
-        ]
-        memo, key = self._memos[len(values["apply"]) == 1], (type(camera), camera.image_size, *state)
+        key = type(camera), camera.image_size, self.augmentation._state_key()
+        of_row, of_batch = self._memos
+        memo = of_row if len(values["apply"]) == 1 else of_batch
         return memo.unless_learning(inputs, key, lambda: self.augmentation.change(camera, values))
 
     @property

@@ -383,6 +383,15 @@ def test_parts_of_a_chain_that_are_added_later_count():
         chain(fields)
 
 
+def test_replays_of_kornia_follow_ranges():
+    lens = camtorch.augment.kornia.RandomLens(camera(), "kannala_brandt", fov=(80, 100), distortion=0.1, min_filled=0)
+    lens(torch.rand(2, 3, *SIZE))
+    params = lens._params
+    lens.augmentation.ranges["fov"] = A.Range(110, 130)  # by which coefficients are measured
+    new = copy.deepcopy(lens)
+    assert torch.equal(lens.change(params).target.distortion, new.change(params).target.distortion)
+
+
 def test_replays_of_kornia_follow_the_order_of_parts():
     flips = A.HorizontalFlip(p=0.5), A.VerticalFlip(p=0.5)
     adapter = copy.deepcopy(camtorch.augment.kornia.CameraAugmentation(A.Compose(flips), camera(), p=1))
