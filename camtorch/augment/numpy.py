@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,8 +29,12 @@ from camtorch.warp.arrays import as_array, as_planes, as_tensor, can_share, plai
 _OWNER = "numpy.Transform"
 _VALID = "_valid"
 
-Way: TypeAlias = tuple[Callable[[Any], Sample], Callable[[Sample, Any], Any]]
-"""How a field is read, value -> tensors by name, and written, (moved sample, value as given) -> value."""
+
+class Way(NamedTuple):
+    """How the fields of a form are read, and written as they were given."""
+
+    read: Callable[[Any], Sample]  # value -> tensors by name
+    write: Callable[[Sample, Any], Any]  # (moved sample, value as given) -> value
 
 
 class Transform(FrontEnd):
@@ -113,20 +117,21 @@ class Transform(FrontEnd):
             sample["camera"] = otherwise
         camera = self.augmentation.camera if sample.get("camera") is None else sample["camera"]
         size = getattr(camera, "image_size", None)
-        own, form = self.augmentation, _form_of(sample)
+        form = _form_of(sample)
         if form is None:
             ways = self._ways(sample, size)
         else:
-            ways = self._forms((), (form, size, {**own.fields}, own.mirroring), lambda: self._ways(sample, size))
-        tensors = {name: read(sample[name]) for name, (read, _) in ways.items()}
+            settings = {**self.augmentation.fields}, self.augmentation.mirroring
+            ways = self._forms((), (form, size, *settings), lambda: self._ways(sample, size))
+        tensors = {name: way.read(sample[name]) for name, way in ways.items()}
         given = Single()
-        for own_tensors in tensors.values():
-            given.update(own_tensors)
+        for of_field in tensors.values():
+            given.update(of_field)
 
         def written(moved: Sample) -> Sample:
             result = {
-                name: write(moved, sample[name])
-                for name, (_, write) in ways.items()
+                name: way.write(moved, sample[name])
+                for name, way in ways.items()
                 if tensors[name].keys() <= moved.keys()  # a face is moved back without its rotation
             }
             for name, value in moved.items():
@@ -147,57 +152,81 @@ class Transform(FrontEnd):
         return kind
 
     def _ways(self, sample: Mapping[str, Any], size: tuple[int, int] | None) -> dict[str, Way]:
-        """Return how each field is read and written, which its form alone decides."""
-        return {name: self._way(name, value, sample, size) for name, value in sample.items()}
+        """Return the way of each field, which its form alone decides: of images, of one, of numbers, or of all else."""
+        ways, mirroring = dict[str, Way](), self.augmentation.mirroring
+        for name, value in sample.items():
+            kind = None if name in (*OWN, PLACE) or value is None else self._kind(name, value, sample)
+            if kind in IMAGES and (name in ALIASES or isinstance(value, (list, tuple))):
+                ways[name] = _way_of_images(name, value, size, kind)
+            elif kind in IMAGES:
+                ways[name] = _way_of_image(name, value, size)
+            elif kind is not None or (mirroring is not None and name in mirroring.by_name):
+                ways[name] = _way_of_numbers(name, value, kind)
+            else:
+                ways[name] = _way_of_others(name)
+        return ways
 
-    def _way(self, name: str, value: Any, sample: Mapping[str, Any], size: tuple[int, int] | None) -> Way:
-        kind = None if name in (*OWN, PLACE) or value is None else self._kind(name, value, sample)
-        mirroring = self.augmentation.mirroring
-        if kind is None and (mirroring is None or name not in mirroring.by_name):
-            return lambda given: {name: given}, lambda moved, given: moved[name]
-        flags, many = name.endswith(_VALID), isinstance(value, (list, tuple))
-        # most arrays are read as they are, without questions for the next samples of the form
-        is_shared = isinstance(value, np.ndarray) and not flags and value.flags.writeable and can_share(value)
-        if kind not in IMAGES:
 
-            def numbers(given: Any) -> Sample:
-                return {name: as_tensor(_numbers(given, name, kind), name, _OWNER)}
+def _way_of_others(name: str) -> Way:
+    return Way(lambda given: {name: given}, lambda moved, given: moved[name])
 
-            def as_given(moved: Sample, given: Any) -> Any:
-                return plain(moved[name]).astype(_numbers(given, name, kind).dtype, copy=False)
 
-            if kind is not None and is_shared and value.dtype.kind == "f":
-                return lambda given: {name: torch.from_numpy(given)}, lambda moved, given: moved[name].numpy()
-            return numbers, as_given
-        if not many and name not in ALIASES:
+def _way_of_numbers(name: str, value: Any, kind: str | None) -> Way:
+    """Return the way of labels, of flags, and of orders of landmarks, whose kind is None."""
+    if kind is not None and _is_shared(name, value) and value.dtype.kind == "f":
+        return Way(lambda given: {name: torch.from_numpy(given)}, lambda moved, given: moved[name].numpy())
 
-            def planes(given: Any) -> Sample:
-                return {name: as_planes(np.asarray(given, bool) if flags else given, name, _OWNER, size)}
+    def read(given: Any) -> Sample:
+        return {name: as_tensor(_numbers(given, name, kind), name, _OWNER)}
 
-            def image(moved: Sample, given: Any) -> Any:
-                return as_array(moved[name], np.asarray(given, bool) if flags else given)
+    def write(moved: Sample, given: Any) -> Any:
+        return plain(moved[name]).astype(_numbers(given, name, kind).dtype, copy=False)
 
-            planes(value)  # raises if it is none
-            if not is_shared:
-                return planes, image
-            if value.ndim == 2:
-                return lambda given: {name: torch.from_numpy(given)[None]}, lambda moved, given: moved[name].numpy()[0]
-            return lambda given: {name: torch.from_numpy(given).permute(2, 0, 1)}, image
-        key = f"{kind}_{name}"  # the augmentation knows a name that begins with a kind
-        if not many and not len(value):  # only the size changes; an image has no channels
-            return (
-                lambda given: {key: torch.from_numpy(given.reshape(given.shape[:3]))},
-                lambda moved, given: np.empty((*moved[key].shape, *given.shape[3:]), given.dtype),
-            )
+    return Way(read, write)
 
-        def each(given: Any) -> Sample:
-            return {f"{key}[{i}]": as_planes(one, f"{name}[{i}]", _OWNER, size) for i, one in enumerate(given)}
 
-        def joined(moved: Sample, given: Any) -> Any:
-            images = [as_array(moved[f"{key}[{i}]"], one) for i, one in enumerate(given)]
-            return images if many else np.stack(images)
+def _way_of_image(name: str, value: Any, size: tuple[int, int] | None) -> Way:
+    """Return the way of an array (H, W) or (H, W, C) of an image, a mask or a depth, or of its flags."""
 
-        return each, joined
+    def array(given: Any) -> Any:
+        return np.asarray(given, bool) if name.endswith(_VALID) else given
+
+    def read(given: Any) -> Sample:
+        return {name: as_planes(array(given), name, _OWNER, size)}
+
+    def write(moved: Sample, given: Any) -> Any:
+        return as_array(moved[name], array(given))
+
+    read(value)  # raises if it is none
+    if not _is_shared(name, value):
+        return Way(read, write)
+    if value.ndim == 2:
+        return Way(lambda given: {name: torch.from_numpy(given)[None]}, lambda moved, given: moved[name].numpy()[0])
+    return Way(lambda given: {name: torch.from_numpy(given).permute(2, 0, 1)}, write)
+
+
+def _way_of_images(name: str, value: Any, size: tuple[int, int] | None, kind: str | None) -> Way:
+    """Return the way of several such arrays, in a list or in an array (N, H, W) or (N, H, W, C)."""
+    key, is_list = f"{kind}_{name}", isinstance(value, (list, tuple))  # a name that begins with a kind is known
+    if not is_list and not len(value):  # only the size changes; an image has no channels
+        return Way(
+            lambda given: {key: torch.from_numpy(given.reshape(given.shape[:3]))},
+            lambda moved, given: np.empty((*moved[key].shape, *given.shape[3:]), given.dtype),
+        )
+
+    def read(given: Any) -> Sample:
+        return {f"{key}[{i}]": as_planes(one, f"{name}[{i}]", _OWNER, size) for i, one in enumerate(given)}
+
+    def write(moved: Sample, given: Any) -> Any:
+        images = [as_array(moved[f"{key}[{i}]"], one) for i, one in enumerate(given)]
+        return images if is_list else np.stack(images)
+
+    return Way(read, write)
+
+
+def _is_shared(name: str, value: Any) -> bool:
+    """Whether torch reads an array's memory as it is: the next samples of the form are then read without questions."""
+    return isinstance(value, np.ndarray) and not name.endswith(_VALID) and value.flags.writeable and can_share(value)
 
 
 def _set(**options: Any) -> Sample:
