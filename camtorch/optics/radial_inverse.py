@@ -183,7 +183,7 @@ def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor
         t = r2 * scale * scale
         factor, slope = radial.derivatives(t, 1)
         step = (1 - scale * factor) / torch.addcmul(factor, t, slope, value=2)
-        if converged is not None:  # a converged point does not depend on its batch
+        if converged is not None:  # stop converged points, so that a result is the same in any batch
             step = torch.where(converged > 0, 0.0, step)
         scale = scale + step
         converged = short(scale.dtype) * scale - step.abs()

@@ -24,7 +24,7 @@ class CameraLike(ModelSpec, BatchedModule):
     _rays: Kept
     _fields: Kept
     _expects_unusable: bool = False  # as of a network's numbers, or of those that a fit tries
-    _told: bool = False  # whether a call has warned of them
+    _told: bool = False  # whether a call has warned of unusable numbers
 
     if TYPE_CHECKING:
         intrinsics: Tensor

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.devices import sent
 from camtorch.evaluate.export import of_points, plus
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import may_look_at
@@ -26,8 +26,14 @@ if TYPE_CHECKING:
 _AT_ONCE = 6  # cameras whose azimuths are followed together
 _STEPS = 129
 # Stages after a radial one that change distances by less than a quarter, and so move points by less than that, are
-# inverted by Newton's method from anywhere: a step comes nearer by at least a third
+# inverted by Newton's method from anywhere: each step leaves at most 2/3 of the distance
 _LEAST_SLOPE, _WIDER = 0.75, 1.25
+
+InverseBy = Literal["radius", "stages", "plane", "either"]
+"""How lenses are inverted: along the radius, by stages, in the plane, or either of the last two, as their camera asks.
+
+It goes along the radius if the lens is radial, and by stages if only the first of them, a radial one, has a limit.
+"""
 
 
 def _per_camera(make: Callable[[Domain], Tensor]) -> cached_property[Tensor]:
@@ -50,53 +56,22 @@ class Domain:
     terms give the radius up to which they certainly are; azimuths are followed only if a point lies further out.
     """
 
-    is_constant: bool = False
-    """Whether the domain is a constant of an exported program for other runtimes."""
+    def __init__(
+        self, optics: Optics, k: Tensor, known: Mapping[str, Any] = MappingProxyType({}), *, is_constant: bool = False
+    ):
+        """Make the domain of a model's `optics` and coefficients (C, n), of the points' dtype and device.
 
-    def __init__(self, optics: Optics, k: Tensor):
-        """Make the domain of a model's `optics` and coefficients (C, n), of the points' dtype and device."""
-        self.optics, self.k = optics, k
-        self.chart, self.lens = optics(columns(k))
+        known: Properties by name, in place of those that it would make. is_constant: Whether it is a constant of an
+        exported program for other runtimes, where no tensor is a view of another.
+        """
+        self.optics, self.k, self.is_constant = optics, k, is_constant
+        self.chart, self.lens = optics([c.clone() for c in columns(k)] if is_constant else columns(k))
+        for name, value in known.items():  # before they are read: a compiler cannot follow a cached property's lock
+            setattr(self, name, value)
 
     def optics_of(self, camera: Tensor) -> tuple[Chart, Lens]:
         """Return the chart and lens of single points (M,), each seen by the camera of that index."""
         return self.optics(of_points(self.k, camera))
-
-    def with_tables(self, safe_radius_sq: Tensor, limits2: Tensor, table: Tensor) -> Domain:
-        """Return this domain with tables made elsewhere, because a compiler cannot follow a cached property's lock."""
-        self.safe_radius_sq, self.limits2 = safe_radius_sq, limits2
-        self.image_radius_sq = safe_radius_sq.clamp(max=self.chart.usual_end(self.k.dtype) ** 2)
-        self.inverse = InverseTable(table) if self.lens.radial else None
-        self.stagewise, self.all_stagewise = None, False  # which would read values
-        return self
-
-    def with_all_tables(self) -> Domain:
-        """Return the same with all tables that a graph may need, for values that are known."""
-        # the tables are constants: none is a view of another
-        made = Domain(self.optics, self.k.clone())
-        made.chart, made.lens = self.optics([c.clone() for c in columns(self.k)])
-        made.is_constant = True
-        if not self.lens.stages:
-            return made
-        tables = ["safe_radius_sq", "image_radius_sq", *(["image_circle_sq"] if self.lens.rest is not None else [])]
-        tables += [] if self.lens.is_radial else ["limits2"]
-        for name in tables:
-            setattr(made, name, getattr(self, name).clone())
-        made.stagewise, made.all_stagewise = self.stagewise, self.all_stagewise
-        made.inverse = None if self.inverse is None else InverseTable(self.table, is_constant=True)
-        if not (self.lens.is_radial or self.all_stagewise):
-            made.extent = self.extent
-        return made
-
-    def found_elsewhere(self, tables: Mapping[str, Tensor]) -> Domain:
-        """Return this domain with tables by their names, which were made on the CPU and are sent to its device."""
-        for name, value in zip(tables, sent([*tables.values()], self.k.device) if tables else (), strict=True):
-            setattr(self, name, value)
-        by_stages = tables.get("stagewise")
-        self.all_stagewise = by_stages is not None and bool(by_stages.all())
-        if by_stages is None or not bool(by_stages.any()):
-            self.stagewise = None
-        return self
 
     @cached_property
     def _followed(self) -> tuple[Tensor, Extent]:
@@ -137,39 +112,44 @@ class Domain:
         furthest_out = torch.where(steps <= 1 + steps[1], furthest, 0.0).amax(-1, keepdim=True)
         return torch.where(certain > _LEAST_SLOPE, furthest_out * furthest_out, torch.inf).to(self.k.dtype)
 
-    @cached_property
-    def stagewise(self) -> Tensor | None:
-        """Whether the inverse goes stage by stage, (C, 1), see `image_circle_sq`; None if that is so for no camera."""
-        stagewise = torch.isfinite(self.image_circle_sq) if self.lens.rest is not None else None
-        return None if stagewise is None or not bool(stagewise.any()) else stagewise
+    @_per_camera
+    def stagewise(self) -> Tensor:
+        """Return (C, 1) bool, whether the inverse goes stage by stage; see `image_circle_sq`."""
+        return torch.isfinite(self.image_circle_sq)
 
     @cached_property
-    def all_stagewise(self) -> bool:
-        """Whether the inverse of all cameras goes stage by stage."""
-        return self.stagewise is not None and bool(self.stagewise.all())
+    def inverse_by(self) -> InverseBy:
+        """How the lenses of all cameras are inverted: "plane" where values may not be read."""
+        return way_of_inverse(self.lens.is_radial, None if self.lens.rest is None else self.stagewise)
+
+    @property
+    def is_circular(self) -> bool:
+        """Whether the domain of all cameras is a circle, whose radius is the fold of the first stage."""
+        return self.inverse_by in ("radius", "stages")
 
     @_per_camera
     def safe_radius_sq(self) -> Tensor:
         """Return (C, 1), the squared radius up to which the lens is certainly regular: of a circular fold, its own."""
-        if self.lens.is_radial or self.all_stagewise:
+        if self.is_circular:
             inner = self._fold.to(self.k.dtype)
         else:
             radii = self.chart.radii(MOST_RADII, self.k)
             lost = first_loss(self.lens.lower_bound(radii.expand(self.k.shape[0], -1))[0])
             inner = radii[(lost - 1).floor().clamp(0, MOST_RADII - 1).long()].unsqueeze(-1)
-            inner = inner if self.stagewise is None else torch.where(self.stagewise, self._fold.to(inner.dtype), inner)
+            if self.inverse_by == "either":
+                inner = torch.where(self.stagewise, self._fold.to(inner.dtype), inner)
         return within(inner.clamp(max=self.chart.end(inner.dtype)))
 
     @_per_camera
     def limits2(self) -> Tensor:
-        """Return squared radii (C, azimuths): from each azimuth to the next, the orientation decides only within them.
+        """Return (C, azimuths), from each azimuth to the next the squared radius up to which the orientation decides.
 
-        They are 0 for cameras whose inverse goes stage by stage.
+        Beyond it the lens is folded. It is 0 for cameras whose domain is a circle.
         """
-        if self.all_stagewise:
+        if self.is_circular:
             return self.k.new_zeros(self.k.shape[0], AZIMUTHS)
         limits2 = self._followed[0]
-        return limits2 if self.stagewise is None else torch.where(self.stagewise, 0.0, limits2)
+        return torch.where(self.stagewise, 0.0, limits2) if self.inverse_by == "either" else limits2
 
     @_per_camera
     def _fold(self) -> Tensor:
@@ -202,7 +182,7 @@ class Domain:
     def margin(self, a: Tensor, b: Tensor, t: Tensor) -> Tensor:
         """Return a margin, positive for the plane points (C, N) in the domain; t is a^2 + b^2."""
         inside = self.safe_radius_sq - t
-        if self.lens.is_radial or self.all_stagewise:
+        if self.is_circular:
             return inside
         if may_look_at(inside):  # few points are as far out
             places = (~(inside > 0)).nonzero(as_tuple=True)
@@ -216,6 +196,15 @@ class Domain:
         index = index + torch.arange(self.k.shape[0], device=t.device, dtype=index.dtype).unsqueeze(-1) * AZIMUTHS
         limits2 = self.limits2.flatten().index_select(0, index.flatten()).view(index.shape)
         return torch.maximum(inside, torch.minimum(limits2 - t, regular(self.lens, a, b)))
+
+
+def way_of_inverse(is_radial: bool, stagewise: Tensor | None) -> InverseBy:
+    """Return the way of the inverse of lenses, of which those that are `stagewise` (C, 1) may go stage by stage."""
+    if is_radial:
+        return "radius"
+    if stagewise is None or not bool(stagewise.any()):
+        return "plane"
+    return "stages" if bool(stagewise.all()) else "either"
 
 
 def regular(lens: Lens, a: Tensor, b: Tensor, to_edge: bool = True) -> Tensor:

@@ -71,7 +71,7 @@ def evaluate_rows(
     if constant is not None and not way.is_native and is_constant(constant) and all(type(side) is int for side in lead):
         with with_values(constant):
             intrinsics, distortion = per_row(constant.tensors, lead, rows)
-            cameras = cameras_of(intrinsics, distortion).with_all_tables()
+            cameras = cameras_of(intrinsics, distortion).as_constant()
         with portable_export(rows) as order:
             return direction.formula(model, rows, intrinsics, distortion, cameras, order)
     known = cameras_of(intrinsics, distortion) if way.is_known else None

@@ -12,10 +12,26 @@ from torch import Tensor
 
 from camtorch.evaluate.recorded import CLASSES
 from camtorch.native.structs import AZIMUTHS
-from camtorch.optics.radial_inverse import TABLE_WIDTH
-from camtorch.projection.domain import domain_of
+from camtorch.optics.radial_inverse import TABLE_WIDTH, InverseTable
+from camtorch.projection.camera_like import CameraLike
+from camtorch.projection.domain import domain_of, way_of_inverse
 from camtorch.projection.solve import search
 from camtorch.values.arguments import columns
+
+
+def recorded_tables(model: type[CameraLike], k: Tensor) -> dict[str, Any]:
+    """Return the properties of a `Domain` that a graph needs, in which no value may be read to choose an inverse."""
+    chart, lens = model.optics(columns(k))
+    if not lens.stages:
+        return {}
+    safe_radius_sq, limits2, table = tables(model.operator_name, k)
+    return {
+        "safe_radius_sq": safe_radius_sq,
+        "image_radius_sq": safe_radius_sq.clamp(max=chart.usual_end(k.dtype) ** 2),
+        "limits2": limits2,
+        "inverse": InverseTable(table) if lens.radial else None,
+        "inverse_by": way_of_inverse(lens.is_radial, None),
+    }
 
 
 @torch.library.custom_op("camtorch::tables", mutates_args=())

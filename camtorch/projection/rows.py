@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.devices import on_cpu
+from camtorch.evaluate.devices import on_cpu, sent
 from camtorch.evaluate.kept import note
 from camtorch.evaluate.tensors import known_true
+from camtorch.optics.radial_inverse import InverseTable
 from camtorch.projection.camera_like import CameraLike
-from camtorch.projection.domain import Domain, domain_of
+from camtorch.projection.domain import Domain, domain_of, way_of_inverse
 from camtorch.projection.native_cameras import Native, native_of
-from camtorch.projection.ops import tables
+from camtorch.projection.ops import recorded_tables
 from camtorch.values.arguments import columns, present
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ class CameraRows:
         """Take concrete values (C, 4), (C, n); or (4,), (n,) of one camera."""
         self.model, self._learns = model, distortion.requires_grad
         known = on_cpu(intrinsics, distortion)
-        self._host = None if known is None else CameraRows(model, known[0], known[1])
+        self._same_on_cpu = None if known is None else CameraRows(model, known[0], known[1])
         self.notes = note(intrinsics), note(distortion)
         first, second = (then if mark is None else then.clone() for then, mark in self.notes)
         values = first, second
@@ -46,7 +47,7 @@ class CameraRows:
             values = values[0][None], values[1][None]
         self.given = values
         self.usable: Tensor | None = None
-        is_plain = _are_plain(model, *values) if self._host is None else self._host.usable is None
+        is_plain = _are_plain(model, *values) if self._same_on_cpu is None else self._same_on_cpu.usable is None
         if not (is_plain or known_true(usable := _usable(model, *values))):
             ideal = _ideal(model, *values)
             values = torch.where(usable, values[0], ideal[0]), torch.where(usable, values[1], ideal[1])
@@ -56,14 +57,14 @@ class CameraRows:
     @cached_property
     def domain(self) -> Domain:
         """The domain in which the lenses are one-to-one; see `Domain`."""
-        if self._host is not None and (native := self._host.native) is not None:
-            return Domain(self.model.optics, self.k).found_elsewhere(native.lenses.tables())
+        if self._same_on_cpu is not None and (native := self._same_on_cpu.native) is not None:
+            return Domain(self.model.optics, self.k, _sent_tables(native, self.k.device))
         return domain_for(self.model, self.k, self._learns)
 
-    def with_all_tables(self) -> CameraRows:
-        """Return the same with all tables that a graph may need."""
-        made = copy.copy(self)
-        made.domain = self.domain.with_all_tables()
+    def as_constant(self) -> CameraRows:
+        """Return the same as a constant of an exported program, with all tables that its graph may need."""
+        made, domain = copy.copy(self), self.domain
+        made.domain = Domain(domain.optics, domain.k.clone(), _constant_tables(domain), is_constant=True)
         return made
 
     @cached_property
@@ -102,6 +103,30 @@ def domain_for(model: type[CameraLike], k: Tensor, learns: bool) -> Domain:
     """Return the domain of lenses (C, n) of a model, kept unless they learn."""
     # lenses that learn will not be used again
     return Domain(model.optics, k) if learns else domain_of(model.operator_name, k, model.optics)
+
+
+def _constant_tables(domain: Domain) -> dict[str, Any]:
+    """Return the properties of a domain whose values are known, as far as a graph may need them; none is a view."""
+    if not domain.lens.stages:
+        return {}
+    names = ["safe_radius_sq"]
+    if domain.inverse_by in ("stages", "either"):
+        names += ["image_circle_sq", "stagewise"]
+    if not domain.is_circular:
+        names += ["image_radius_sq", "limits2"]
+    known: dict[str, Any] = {name: getattr(domain, name).clone() for name in names}
+    if not domain.is_circular:
+        known["extent"] = domain.extent
+    inverse = InverseTable(domain.table, is_constant=True) if domain.lens.radial else None
+    return {**known, "inverse": inverse, "inverse_by": domain.inverse_by}
+
+
+def _sent_tables(native: Native, device: torch.device) -> dict[str, Any]:
+    """Return the properties of a domain that native code made on the CPU, on another device."""
+    made = native.lenses.tables()
+    there = sent([*made.values()], device) if made else ()
+    by = way_of_inverse(native.plan.is_radial, made.get("stagewise"))
+    return {**dict(zip(made, there, strict=True)), "inverse_by": by}
 
 
 def _are_plain(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> bool:
@@ -182,9 +207,7 @@ class Traced(NamedTuple):
             able = _usable(model, intrinsics.detach(), distortion.detach())
             usable = able.to(intrinsics.dtype)
             k = torch.where(able, distortion.detach(), _ideal(model, intrinsics, distortion)[1])
-            domain = Domain(model.optics, k)
-            if domain.lens.stages:
-                domain.with_tables(*tables(model.operator_name, k))
+            domain = Domain(model.optics, k, recorded_tables(model, k))
         if usable is not None:
             ideal = _ideal(model, intrinsics, distortion)
             intrinsics, distortion = (

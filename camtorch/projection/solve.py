@@ -19,55 +19,61 @@ from camtorch.projection.fold import azimuth
 if TYPE_CHECKING:
     from camtorch.projection.domain import Domain
 
-Found = tuple[Tensor, Tensor, Tensor]
+Searched = tuple[Tensor, Tensor, Tensor]
 
-_CLOSE = 0.02
-_SLOWEST_TURN = 0.05
-_GIVE_UP = 1e-4
+_CLOSE = 0.02  # of a point's distance from the centre: a start whose image is as near to the point is good enough
+_SLOWEST_TURN = 0.05  # radians that an image turns by, for each by which its point turns: the least that secants assume
+_GIVE_UP = 1e-4  # of a step of Newton's method: shorter parts of it are not tried
 _STAGE_STEPS = 12  # the first ones may take off no more than a third, see `domain._LEAST_SLOPE`
 _FIRST_STEPS, _LATE_STEPS = 6, 54  # late points lie next to a fold, or so far out that a prism dominates
 
 
-def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
+def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Searched:
     """Return points (M,) in the domain that the lens of a `camera` (M,) sends to (u, v), and whether there are any."""
-    if domain.lens.is_radial:
+    by = domain.inverse_by
+    if by == "radius":
         return _Search(domain, camera)(u, v)
     if domain.is_constant:
-        return _search_recorded(domain, camera, u, v)
-    if domain.stagewise is None:
+        return _search_exported(domain, camera, u, v)
+    if by == "stages":
+        return _by_stages(domain, camera, u, v)
+    if by == "plane":
         return _within_extents(domain, camera, u, v)
     stagewise = domain.stagewise[camera, 0]
     found = _find_chosen(stagewise, u, lambda some: _by_stages(domain, camera[some], u[some], v[some]))
     return _find_chosen(~stagewise, u, lambda some: _within_extents(domain, camera[some], u[some], v[some]), found)
 
 
-def _search_recorded(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
-    by_stages = None
-    if domain.stagewise is not None:
-        first, within = _first_image(domain, camera, u, v)
+def _search_exported(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Searched:
+    """Run `search` for all points in the ways that cameras need, as a part of an exported program."""
+
+    def by_stages() -> Searched:
+        first, within = _first_image_of_points(domain, camera, u, v)
         a, b, there = _Search(domain, camera, is_circle=True)(u, v, first)
-        by_stages = a, b, there & within
-        if domain.all_stagewise:
-            return by_stages
-    within = (u * u + v * v).sqrt() <= domain.extent.furthest[camera, azimuth(u, v)]
-    a, b, there = _Search(domain, camera, within=within)(u, v)
-    found = a, b, there & within
-    if by_stages is None:
-        return found
-    assert domain.stagewise is not None  # as `by_stages` is not None
-    stagewise = domain.stagewise[camera, 0]
-    a, b = (torch.where(stagewise, *pair) for pair in zip(by_stages[:2], found[:2], strict=True))
-    return a, b, (stagewise & by_stages[2]) | (~stagewise & found[2])  # ONNX Runtime cannot select bools
+        return a, b, there & within
+
+    def in_plane() -> Searched:
+        within = (u * u + v * v).sqrt() <= domain.extent.furthest[camera, azimuth(u, v)]
+        a, b, there = _Search(domain, camera, within=within)(u, v)
+        return a, b, there & within
+
+    if domain.inverse_by == "stages":
+        return by_stages()
+    if domain.inverse_by == "plane":
+        return in_plane()
+    stagewise, staged, planar = domain.stagewise[camera, 0], by_stages(), in_plane()
+    a, b = (torch.where(stagewise, *pair) for pair in zip(staged[:2], planar[:2], strict=True))
+    return a, b, (stagewise & staged[2]) | (~stagewise & planar[2])  # ONNX Runtime cannot select bools
 
 
-def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
+def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Searched:
     """Run `search` if only the first stage, a radial one, has a limit: the point that it must reach decides."""
-    (p, q), within = _first_image(domain, camera, u, v)
+    (p, q), within = _first_image_of_points(domain, camera, u, v)
     alone = partial(_Search, domain, is_circle=True)
     return _find_chosen(within, u, lambda some: alone(camera[some])(u[some], v[some], (p[some], q[some])))
 
 
-def _first_image(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Planes2, Tensor]:
+def _first_image_of_points(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Planes2, Tensor]:
     """Return the points that the stages after the first one send to (u, v), and whether the first one reaches them."""
     rest, table = domain.optics_of(camera)[1].rest, domain.inverse
     assert rest is not None  # the caller checked it
@@ -82,13 +88,15 @@ def _first_image(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[
     return (p, q), (u * u + v * v <= domain.image_circle_sq[camera, 0]) & (p * p + q * q <= most2)
 
 
-def _within_extents(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Found:
+def _within_extents(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Searched:
     """Run `search` for any other lens, for the points within the extent of what it shows."""
     within = torch.hypot(u, v) <= domain.extent.furthest[camera, azimuth(u, v)]
     return _find_chosen(within, u, lambda some: _Search(domain, camera[some])(u[some], v[some]))
 
 
-def _find_chosen(chosen: Tensor, like: Tensor, find: Callable[[Tensor], Found], into: Found | None = None) -> Found:
+def _find_chosen(
+    chosen: Tensor, like: Tensor, find: Callable[[Tensor], Searched], into: Searched | None = None
+) -> Searched:
     """Return the results of `find` for the indices of the chosen points; for others zeros, or those of `into`."""
     a, b, found = into or (torch.zeros_like(like), torch.zeros_like(like), torch.zeros_like(chosen))
     (some,) = chosen.nonzero(as_tuple=True)
@@ -106,7 +114,7 @@ class _Search:
         self.chart, self.lens = domain.optics_of(camera)
         self.is_circle = is_circle or self.lens.is_radial
 
-    def __call__(self, u: Tensor, v: Tensor, first: Planes2 | None = None) -> Found:
+    def __call__(self, u: Tensor, v: Tensor, first: Planes2 | None = None) -> Searched:
         """Search; `first` is where the first stage must send the points, if the fold is a circle; by default (u, v)."""
         a, b = self.radial(*(first or (u, v))) if self.is_circle else self.planar(u, v)
         at = self.lens.at(a, b)
@@ -158,7 +166,7 @@ class _Search:
             a[late], b[late], _ = alone.newton(u[late], v[late], a[late], b[late], _LATE_STEPS)
         return a, b
 
-    def newton(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor, steps: int) -> Found:
+    def newton(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor, steps: int) -> Searched:
         """Return points, and which of them would still move, after steps that come nearer and stay inside.
 
         Nearer in Deuflhard's sense means that the next step by the same Jacobian is shorter. If a lens stretches one
@@ -201,7 +209,7 @@ class _Search:
             rho = extent.start(self.camera, target, c, s)
             x, y = self.lens(rho * c, rho * s)
             error = (u - x) ** 2 + (v - y) ** 2
-            better = (error < best) & far  # a close point does not depend on its batch
+            better = (error < best) & far  # stop close points, so that a result is the same in any batch
             a, b, best = (torch.where(better, n, o) for n, o in ((rho * c, a), (rho * s, b), (error, best)))
             far = far & (best > _CLOSE**2 * target * target)
             off = torch.atan2(x * v - y * u, x * u + y * v)

@@ -37,11 +37,21 @@ class Found(NamedTuple):
 
 def invert(domain: Domain, u: Tensor, v: Tensor) -> Found:
     """Return the points that the lens sends to (u, v), by a table and Newton's method; `search` finds the others."""
-    if domain.lens.is_radial:
+    by = domain.inverse_by
+    if by == "radius":
         return _invert_radial(domain, u, v)
-    if domain.all_stagewise:
+    if by == "stages":
         return _invert_stagewise(domain, u, v)
-    # in the plane, starting from the inverse of the radial factor
+    found = _invert_in_plane(domain, u, v)
+    if by == "plane":
+        return found
+    # choose for each camera, so that it does not depend on its batch
+    pairs = zip(_invert_stagewise(domain, u, v), found, strict=True)
+    return Found(*(torch.where(domain.stagewise, stagewise, planar) for stagewise, planar in pairs))
+
+
+def _invert_in_plane(domain: Domain, u: Tensor, v: Tensor) -> Found:
+    """Invert the whole lens by Newton's method, starting from the inverse of the radial factor."""
     a, b = domain.lens.start(u, v)
     if domain.inverse is not None:
         # a stage may have sent a pixel far off the image out of the floating-point range
@@ -52,12 +62,7 @@ def invert(domain: Domain, u: Tensor, v: Tensor) -> Found:
     # and a ray's rounding must not carry it across the fold
     image_radius_sq = times(domain.image_radius_sq, 1 - 32 * torch.finfo(u.dtype).eps)
     inside = image_radius_sq - torch.addcmul(inner.a * inner.a, inner.b, inner.b)
-    found = inner._replace(solved=torch.minimum(inner.solved, inside))
-    if domain.stagewise is None:
-        return found
-    # choose for each camera, so that it does not depend on its batch
-    pairs = zip(_invert_stagewise(domain, u, v), found, strict=True)
-    return Found(*(torch.where(domain.stagewise, stagewise, planar) for stagewise, planar in pairs))
+    return inner._replace(solved=torch.minimum(inner.solved, inside))
 
 
 def _invert_stagewise(domain: Domain, u: Tensor, v: Tensor) -> Found:
@@ -98,7 +103,7 @@ def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Found:
         at = lens.at(a, b)
         x, y = at.value
         da, db, reciprocal = newton_step(at.jacobian, u - x, v - y)
-        if converged is not None:  # a converged point does not depend on its batch
+        if converged is not None:  # stop converged points, so that a result is the same in any batch
             da, db = torch.where(converged > 0, 0.0, da), torch.where(converged > 0, 0.0, db)
         a, b = a + da, b + db
         t = torch.addcmul(a * a, b, b)
