@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
+from camtorch.cameras.image_sizes import off_centre, warn_of_order, warn_of_size
 from camtorch.cameras.mixed import Mixed
-from camtorch.cameras.numbers import off_centre, warn_of_order, warn_of_size
 from camtorch.evaluate.tensors import known_false
 from camtorch.models import Pinhole
 from camtorch.values.arguments import check_degrees

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -15,8 +14,9 @@ from typing_extensions import Self, TypeVar
 
 from camtorch.cameras.catalogue import Catalogue
 from camtorch.cameras.editing import Editable
-from camtorch.cameras.freezing import INTRINSICS, PREFIX, Freezable, all_frozen, learning_words, with_frozen
+from camtorch.cameras.freezing import INTRINSICS, PREFIX, Freezable, learning_words, with_frozen
 from camtorch.cameras.kornia import to_kornia
+from camtorch.cameras.learning import parameter_groups
 from camtorch.cameras.numbers import camera_of_fov, check_fast, checked_numbers, numbers_of_matrix, replaced
 from camtorch.convert.result import Conversion
 from camtorch.evaluate.door import refuse_jit_trace
@@ -32,9 +32,9 @@ from camtorch.projection.unproject import UNPROJECT
 from camtorch.rays.depth import backproject
 from camtorch.rays.explanation import explain
 from camtorch.rays.fields import local_pinhole, on_image, over_image, patch_centres, perspective_field, plucker
-from camtorch.rays.lattices import field_of_view, movement
+from camtorch.rays.lattices import field_of_view
 from camtorch.rays.polyline import project_polyline
-from camtorch.values.arguments import Numbers, as_number, broadcast_shapes, hinting, warn
+from camtorch.values.arguments import Numbers, broadcast_shapes, hinting, warn
 from camtorch.values.module import GeometryModule, typed_as
 
 Model = TypeVar("Model", bound="Camera", default="Camera")
@@ -270,23 +270,7 @@ class Camera(Freezable, Editable):
             ValueError: If nothing learns, `lr` is not positive, or there are coefficients and no image_size.
             TypeError: If a network predicted the camera, or it was made from one that learns.
         """
-        owner, steps = f"{type(self).__name__}.parameter_groups", dict[Tensor, float]()
-        if not 0 < (lr := as_number(lr, "lr", owner)) < math.inf:
-            raise ValueError(f"{owner}: lr must be a positive number of pixels; got {lr!r}")
-        for camera in (part for part in self.modules() if isinstance(part, Camera) and not part.is_mixed):
-            parts: Any = camera._modules.get("parametrizations", {})
-            for name in [name for name in camera.tensor_names if not all_frozen(camera, name)]:
-                held: Any = (
-                    parts[name].parameters() if name in parts else [{**camera._buffers, **camera._parameters}[name]]
-                )
-                for tensor in (t for t in held if t.requires_grad):
-                    if not tensor.is_leaf:
-                        instead = "Pass the parameters of the network or camera that it is made of to the optimizer"
-                        raise TypeError(f"{owner}: {name} must be a Parameter; got a tensor of a graph. {instead}")
-                    steps[tensor] = min(lr / _effect(camera, name, tensor), steps.get(tensor, math.inf))
-        if not steps:
-            raise ValueError(f"{owner}: camera must learn; got a fixed one. Call camera.requires_grad_() before")
-        return [{"params": [tensor], "lr": step, "weight_decay": 0.0} for tensor, step in steps.items()]
+        return parameter_groups(self, lr)
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -612,17 +596,6 @@ class Camera(Freezable, Editable):
         if self.image_size:
             parts.append(f"image_size={self.image_size}")
         return ", ".join([*parts, *learning_words(self)])
-
-
-def _effect(camera: Camera, name: str, tensor: Tensor) -> float:
-    """Return by how many pixels one unit of a number of `tensor`, which `name` is made of, moves it at most."""
-    given = name == "intrinsics"
-    weights = torch.ones(4) if given else movement(camera, camera.distortion, camera.intrinsics, lattice=33)
-    count = weights.shape[-1]
-    with torch.enable_grad():
-        pixels = (getattr(camera, name) * weights.reshape(-1, count).amax(0).to(tensor)).reshape(-1, count).sum(0)
-        moved = [torch.autograd.grad(one, tensor, retain_graph=True)[0].abs().amax() for one in pixels]
-    return max(map(float, moved)) or 1e3  # small steps without an effect, like that of FOV's omega at 0
 
 
 def as_model(model: type[Camera] | str, owner: str) -> type[Camera]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-from camtorch.cameras.numbers import stack_numbers, unstack_numbers, warn_of_exchange
+from camtorch.cameras.image_sizes import warn_of_exchange
 from camtorch.evaluate.tensors import are_numbers, known_false, known_true
 from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
@@ -50,15 +50,32 @@ def edited(
         maps: Any = matrix.detach().double().numpy() if xp is np else precise(matrix.to(own.device))
         rows = [[maps[..., i, j] for j in range(3)] for i in range(2)]
     (a, b, left), (c, d, top) = rows
-    fx, fy, cx, cy = unstack_numbers(own, xp)
+    fx, fy, cx, cy = _unstack_numbers(own, xp)
     focal = abs(a) * fx + abs(b) * fy, abs(c) * fx + abs(d) * fy
     centre = a * cx + b * cy + left, c * cx + d * cy + top
     turns = turned = b != 0
     if isinstance(matrix, Tensor):  # read where it was drawn, so as not to wait for a device
         turns = np.any(turned) if xp is np else not known_true(matrix[..., 0, 1] == 0)
     distortion = _edit_distortion(camera, a - b, c + d, turned if turns else None)
-    intrinsics = stack_numbers((*focal, *centre), own, xp)
+    intrinsics = _stack_numbers((*focal, *centre), own, xp)
     return remade(camera, learns, intrinsics=intrinsics, distortion=distortion, image_size=image_size)
+
+
+def _unstack_numbers(intrinsics: Tensor, xp: Any) -> Iterable[Any]:
+    """Return fx, fy, cx, cy of intrinsics (*B, 4) in float64, as tensors, or as numbers and arrays."""
+    if xp is torch:
+        return precise(intrinsics).unbind(-1)
+    return intrinsics.tolist() if intrinsics.ndim == 1 else intrinsics.detach().double().numpy().T
+
+
+def _stack_numbers(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
+    """Return (*B, n) for n tensors (*B,), or for numbers and arrays, in the dtype of a tensor."""
+    if xp is torch:
+        return torch.stack(torch.broadcast_tensors(*numbers), -1).to(like.dtype)
+    kind = np.float64 if like.dtype == torch.float64 else np.float32
+    if {float, np.float64}.issuperset(map(type, numbers)):
+        return torch.from_numpy(np.array(numbers, kind))
+    return torch.from_numpy(np.stack(np.broadcast_arrays(*numbers), -1).astype(kind, copy=False))
 
 
 def _edit_distortion(camera: CameraLike, across: Any, down: Any, on_side: Any) -> Tensor:

@@ -29,11 +29,33 @@ class _Group(NamedTuple):
     """Cameras of one model and number of coefficients, which are evaluated at once."""
 
     model: type[Camera]
-    members: tuple[int, ...]  # indices of the modules that it is made of
-    counts: tuple[int | None, ...]  # the number of cameras of each; None for a single one
-    taken: tuple[int, ...] | None  # the rows of those, one after the other; None for all in order
-    rows: tuple[int, ...]  # the place of each in the batch, ascending
+    members: tuple[int, ...]  # the places in `Mixed.cameras` of the modules that hold them
+    counts: tuple[int | None, ...]  # how many cameras each member has; None for a single one
+    taken: tuple[int, ...] | None  # the group's among all cameras of the members, one after the other; None for all
+    rows: tuple[int, ...]  # of the batch, which they fill, ascending
     memo: Kept
+
+    @property
+    def is_whole_member(self) -> bool:
+        """Whether the group is all cameras of one member, in order."""
+        return len(self.members) == 1 and self.taken is None
+
+    def index_on(self, device: torch.device) -> slice | Tensor:
+        """Return the index of its rows in the batch; a slice, of which nothing is copied, if they follow each other."""
+        start, stop = self.rows[0], self.rows[-1] + 1
+        return slice(start, stop) if stop - start == len(self.rows) else torch.tensor(self.rows, device=device)
+
+    def stacked(self, tensors: Sequence[Tensor]) -> Tensor:
+        """Return the numbers (C, n) of its cameras for tensors of the members; (n,) if a whole member shares them."""
+        if self.is_whole_member:
+            return tensors[0].unsqueeze(0) if self.counts[0] is None else tensors[0]
+        if not any(self.counts):
+            whole = torch.stack(list(tensors))
+        else:
+            pairs = zip(tensors, self.counts, strict=True)
+            whole = torch.cat([t.expand(1 if count is None else count, t.shape[-1]) for t, count in pairs])
+        taken = self.taken
+        return whole if taken is None else whole.index_select(0, torch.tensor(taken, device=whole.device))
 
 
 class Mixed(Camera):
@@ -70,16 +92,18 @@ class Mixed(Camera):
         super(Camera, self).__init__()  # it has no numbers of its own
         self.cameras = nn.ModuleList(members)
         self.image_size: tuple[int, int] | None = members[0].image_size
+        # for each row of the batch the place of its member in `cameras`, and the row there
         self._places = tuple(given if order is None else [given[i] for i in _as_order(order, len(given))])
         self._rays, self._fields = Kept(), Kept()
         kinds: dict[tuple[object, ...], list[int]] = {}
         for row, (i, _) in enumerate(self._places):
             kinds.setdefault(kind(members[i]), []).append(row)
         self._groups = tuple(self._group(members, rows) for rows in kinds.values())
-        places_in_groups = {row: n for n, row in enumerate(row for group in self._groups for row in group.rows)}
-        self._order = tuple(places_in_groups[row] for row in range(len(self._places)))
+        # for each row of the batch its place among the rows of the groups, one after the other
+        self._order = tuple(_inverse([row for group in self._groups for row in group.rows]))
 
     def _group(self, members: Sequence[Camera], rows: Sequence[int]) -> _Group:
+        """Return the group of rows whose cameras are of one kind."""
         places = [self._places[row] for row in rows]
         used, index = _among_used(members, places)
         whole = index == tuple(range(sum(_count(members[i]) for i in used)))
@@ -98,20 +122,19 @@ class Mixed(Camera):
             rows = [int(row) for of_group, _ in groups for row in of_group]
         except (TypeError, ValueError):
             raise TypeError(f"Mixed: groups must be pairs (rows, cameras); got {shown(groups)}") from None
-        place = {row: i for i, row in enumerate(rows)}
-        if sorted(place) != list(range(len(rows))):
+        if sorted(rows) != list(range(len(rows))):
             raise ValueError(f"Mixed: groups must fill every row once; got rows {rows}")
-        return cls([camera for _, camera in groups], order=[place[row] for row in range(len(rows))])
+        return cls([camera for _, camera in groups], order=_inverse(rows))
 
     @property
     def groups(self) -> list[tuple[list[int], Camera]]:
         """The rows of each model and number of coefficients, and their cameras as a batch; gradients go to all."""
         made = []
         for group, (intrinsics, distortion) in zip(self._groups, self._pairs(self.tensors), strict=True):
-            first = self._member(group.members[0])
-            if group.counts[1:] or group.counts[0] is None or group.taken is not None:
-                first = remade(first, intrinsics=intrinsics, distortion=distortion)
-            made.append((list(group.rows), first))
+            batch = self._member(group.members[0])
+            if not (group.is_whole_member and batch.batch_shape):
+                batch = remade(batch, intrinsics=intrinsics, distortion=distortion)
+            made.append((list(group.rows), batch))
         return made
 
     def _member(self, i: int) -> Camera:
@@ -129,7 +152,7 @@ class Mixed(Camera):
         members = cast("list[Camera]", list(self.cameras._modules.values()))
         for group in self._groups:
             pairs = [members[i].tensors for i in group.members]
-            tensors += [_stack_group(numbers, group) for numbers in zip(*pairs, strict=True)]
+            tensors += [group.stacked(numbers) for numbers in zip(*pairs, strict=True)]
         if all(t.dtype == tensors[0].dtype for t in tensors):
             return tuple(tensors)
         wide = working_dtype(tensors[0], *tensors)
@@ -176,10 +199,7 @@ class Mixed(Camera):
         for group, pair in zip(self._groups, self._pairs(tensors), strict=True):
             here, count = rows, lead
             if len(self._groups) > 1:
-                start, stop = group.rows[0], group.rows[-1] + 1
-                contiguous = stop - start == len(group.rows)
-                index = slice(start, stop) if contiguous else torch.tensor(group.rows, device=rows.device)
-                here, count = rows[index], torch.Size((len(group.rows),))
+                here, count = rows[group.index_on(rows.device)], torch.Size((len(group.rows),))
             cameras_of = partial(self._kept_cameras, group)
             results.append(evaluate_rows(group.model, direction, here, count, pair, cameras_of, None))
         if len(results) == 1:
@@ -319,10 +339,15 @@ def _count(camera: Camera) -> int:
     return len(camera) if camera.batch_shape else 1
 
 
+def _inverse(order: Sequence[int]) -> list[int]:
+    """Return the place of each number from 0 in an order that has each once."""
+    return sorted(range(len(order)), key=order.__getitem__)
+
+
 def _among_used(
     members: Sequence[Camera], places: Sequence[tuple[int, int]]
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the members that hold the cameras at (member, row), and the cameras' places if those stand in a row."""
+    """Return the members that hold the cameras at (member, row), and the cameras' places among all that these hold."""
     used = tuple(dict.fromkeys(i for i, _ in places))
     starts = accumulate((_count(members[i]) for i in used), initial=0)
     first = dict(zip(used, starts, strict=False))
@@ -374,19 +399,6 @@ def _as_order(order: Sequence[int], count: int) -> list[int]:
 def kind(camera: Camera) -> tuple[type[Camera], int, tuple[int, int] | None]:
     """Return the properties that cameras must have in common to be rows of one batch of one model."""
     return type_before_parametrizations(camera), camera.distortion.shape[-1], camera.image_size
-
-
-def _stack_group(tensors: Sequence[Tensor], group: _Group) -> Tensor:
-    """Return (C, n), the numbers of all cameras of a group, or those that its cameras share if it is one batch."""
-    if group.counts[1:] or group.taken is not None:
-        if not any(group.counts):
-            whole = torch.stack(list(tensors))
-        else:
-            pairs = zip(tensors, group.counts, strict=True)
-            whole = torch.cat([t.expand(1 if count is None else count, t.shape[-1]) for t, count in pairs])
-        taken = group.taken
-        return whole if taken is None else whole.index_select(0, torch.tensor(taken, device=whole.device))
-    return tensors[0] if group.counts[0] else tensors[0].unsqueeze(0)
 
 
 def collate_cameras(batch: Sequence[Camera], *, collate_fn_map: Any = None) -> Camera | list[Camera]:

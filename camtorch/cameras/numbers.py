@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -11,8 +11,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
+from camtorch.cameras.image_sizes import (
+    CENTRED,
+    LOOKED_AT,
+    SIZE_LIKE,
+    Rows,
+    off_centre,
+    off_middle,
+    warn_of_order,
+    warn_of_size,
+)
 from camtorch.evaluate.tensors import are_free, is_kept, is_predicted, known_false, row_of, values_of
-from camtorch.optics.radial_inverse import precise
 from camtorch.projection.camera_like import CameraLike
 from camtorch.rays.lattices import AXES, focal_for
 from camtorch.values.arguments import (
@@ -24,28 +33,15 @@ from camtorch.values.arguments import (
     check_degrees,
     check_devices,
     one_of,
-    warn,
 )
 from camtorch.values.module import remade
 
 CameraT = TypeVar("CameraT", bound=CameraLike)
-Rows = list[list[float]]  # fx, fy, cx, cy of each camera
 _Checked = tuple[Tensor, Tensor, tuple[str, ...], torch.Size, tuple[int, int] | None]
 
 _OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
 _DTYPES, _NUMBERS = (torch.float32, torch.float64), {float, int}
 _LARGE = 1e30  # float32 can hold it, and NaN is not below it
-_SIZE_LIKE = 32  # px; two whole coefficients from here on are an image size
-_LOOKED_AT = 64  # cameras of a batch that are checked: a wrong order is in all of them
-_CENTRED, _NEAR = 0.1, 0.05
-"""Parts of the image's sides: how far from its middle most principal points lie, and how near one lies on purpose."""
-_FAR = 0.14  # both parts, to one side: the images of the calibration were larger or smaller
-_SIZES = """
-224x224 256x256 240x320 270x480 360x480 360x640 400x640 480x640 480x752 512x512 540x960 576x720 600x800 600x960
-720x1280 768x1024 800x1280 960x1280 1024x1024 1024x1280 1080x1440 1080x1920 1200x1600 1200x1920 1440x1920 1440x2560
-1536x2048 1944x2592 2160x3840 2448x3264 3000x4000 3024x4032
-"""  # of cameras
-_CUT_OUT = "For a part of an image use camera.crop"
 
 
 def checked_numbers(
@@ -70,45 +66,53 @@ def checked_numbers(
 
 
 def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: Any) -> _Checked | None:
-    """Return `checked_numbers` for lists of a camera, or plain tensors of some, that are right at a glance, or None."""
+    """Return `checked_numbers` for lists of one camera, or plain tensors of some; None if a longer look is needed.
+
+    Fast path: None sends the call to `checked_numbers`, which alone raises and warns.
+    """
     if not (model.always_defined and are_free(*[value for value in (intrinsics, distortion) if type(value) is Tensor])):
         return None
-    made: list[Tensor] = []
-    tables: list[Rows] = []
-    for value in (intrinsics, distortion):
-        if type(value) is list and _NUMBERS.issuperset(map(type, value)):
-            tensor, rows = torch.empty(len(value)), [value]
-        elif type(value) is Tensor and value.ndim == 1 and not value.requires_grad:
-            tensor, rows = value.clone(), [value.tolist()]
-        elif type(value) is Tensor and value.ndim == 2 and 0 < len(value) <= _LOOKED_AT and not is_predicted(value):
-            tensor, rows = value.clone(), value.tolist()
-        elif value is None and not model.default_count and made:
-            rows = [[]] * len(tables[0])
-            tensor = made[0].new_empty(0) if made[0].ndim == 1 else made[0].new_empty(len(rows), 0)
-        else:
-            return None
-        if not (tensor.dtype in _DTYPES and tensor.is_cpu):
-            return None
-        most = _SIZE_LIKE if made else _LARGE
-        for row in rows:
-            if not sum(map(abs, row)) < most:
-                return None
-        if rows[0] is value:
-            tensor.numpy()[:] = value  # takes half the time of torch.tensor
-        made.append(nn.Parameter(tensor) if rows[0] else tensor)
-        tables.append(rows)
-    numbers, k = tables
-    names = _names_of(model, len(k[0]))  # type: ignore[arg-type]  # a class can be hashed
-    if len(numbers[0]) != 4 or made[0].ndim != made[1].ndim or len(numbers) != len(k) or names is None:
+    if (given := _plain_rows(intrinsics, _LARGE)) is None:
         return None
-    if size is not None and not (
-        type(size) is tuple and len(size) == 2 and type(size[0]) is type(size[1]) is int and min(size) > 0
-    ):
+    numbers, rows = given
+    if distortion is None and not model.default_count:
+        k = numbers.new_empty(*numbers.shape[:-1], 0)
+    elif (given := _plain_rows(distortion, SIZE_LIKE)) is not None:
+        k = given[0]
+    else:
         return None
-    for fx, fy, cx, cy in numbers:
-        if not (fx > 0 and fy > 0 and (size is None or _off_centre(cx, cy, size) <= _CENTRED)):
+    names = _names_of(model, k.shape[-1])  # type: ignore[arg-type]  # a class can be hashed
+    if numbers.shape[-1] != 4 or numbers.shape[:-1] != k.shape[:-1] or names is None:
+        return None
+    if size is not None and not (type(size) is tuple and [*map(type, size)] == [int, int] and min(size) > 0):
+        return None
+    for fx, fy, cx, cy in rows:
+        if not (fx > 0 and fy > 0 and (size is None or off_middle(cx, cy, size) <= CENTRED)):
             return None
-    return made[0], made[1], names, made[0].shape[:-1], size
+    return numbers, k, names, numbers.shape[:-1], size
+
+
+def _plain_rows(value: Any, most: float) -> tuple[Tensor, Rows] | None:
+    """Return a list, or a tensor of few rows, as a new Parameter, and its rows; None for other values, and large ones.
+
+    The absolute values of a row are to sum to less than `most`. A tensor without values does not learn.
+    """
+    if type(value) is list and _NUMBERS.issuperset(map(type, value)):
+        tensor, rows = torch.empty(len(value)), [value]
+    elif type(value) is Tensor and value.ndim == 1 and not value.requires_grad:
+        tensor, rows = value.clone(), [value.tolist()]
+    elif type(value) is Tensor and value.ndim == 2 and 0 < len(value) <= LOOKED_AT and not is_predicted(value):
+        tensor, rows = value.clone(), value.tolist()
+    else:
+        return None
+    if not (tensor.dtype in _DTYPES and tensor.is_cpu):
+        return None
+    for row in rows:
+        if not sum(map(abs, row)) < most:
+            return None
+    if rows[0] is value:
+        tensor.numpy()[:] = value  # takes half the time of torch.tensor
+    return nn.Parameter(tensor) if rows[0] else tensor, rows
 
 
 _names_of = functools.lru_cache(maxsize=256)(lambda model, count: model.names_of(count))
@@ -139,7 +143,7 @@ def checked_distortion(model: type[CameraLike], distortion: Numbers, intrinsics:
     owner = model.__name__
     distortion = as_real(distortion, "distortion", owner, intrinsics.device)
     row = row_of(distortion)
-    if row is not None and len(row) == 2 and min(row) >= _SIZE_LIKE and all(map(float.is_integer, row)):
+    if row is not None and len(row) == 2 and min(row) >= SIZE_LIKE and all(map(float.is_integer, row)):
         raise ValueError(f"{owner}: distortion must not be an image size; got {row}. Use image_size=(height, width)")
     if not model.distortion_names and distortion.numel():
         raise ValueError(
@@ -198,23 +202,6 @@ def as_numbers_of(camera: CameraLike, value: Numbers, name: str) -> Tensor:
         return value
     as_real(value, name, type_before_parametrizations(camera).__name__)
     return torch.as_tensor(np.asarray(value, dtype=np.float64)).to(camera.intrinsics)
-
-
-def unstack_numbers(intrinsics: Tensor, xp: Any) -> Iterable[Any]:
-    """Return fx, fy, cx, cy of intrinsics (*B, 4) in float64, as tensors, or as numbers and arrays."""
-    if xp is torch:
-        return precise(intrinsics).unbind(-1)
-    return intrinsics.tolist() if intrinsics.ndim == 1 else intrinsics.detach().double().numpy().T
-
-
-def stack_numbers(numbers: Sequence[Any], like: Tensor, xp: Any) -> Tensor:
-    """Return (*B, n) for n tensors (*B,), or for numbers and arrays, in the dtype of a tensor."""
-    if xp is torch:
-        return torch.stack(torch.broadcast_tensors(*numbers), -1).to(like.dtype)
-    kind = np.float64 if like.dtype == torch.float64 else np.float32
-    if {float, np.float64}.issuperset(map(type, numbers)):
-        return torch.from_numpy(np.array(numbers, kind))
-    return torch.from_numpy(np.stack(np.broadcast_arrays(*numbers), -1).astype(kind, copy=False))
 
 
 def _is_column(model: type[CameraLike], distortion: Tensor) -> bool:
@@ -307,77 +294,3 @@ def camera_of_fov(
             + ", ".join(f"{angle:.5g}" for angle in widest)
         )
     return made
-
-
-def off_centre(intrinsics: Tensor, size: tuple[int, int]) -> Rows:
-    """Return the rows of plain numbers (*B, 4); none if a principal point is near the middle of images of `size`."""
-    if is_kept(intrinsics) or is_predicted(intrinsics):
-        return []
-    row = row_of(intrinsics)
-    known = values_of(intrinsics) if row is None else None
-    rows = [row] if row is not None else [] if known is None else known.reshape(-1, 4)[:_LOOKED_AT].tolist()
-    return [] if any(_off_centre(cx, cy, size) <= _CENTRED for _, _, cx, cy in rows) else rows
-
-
-def warn_of_order(rows: Rows, size: tuple[int, int], owner: str, order: str = "(height, width)") -> None:
-    """Warn of rows `off_centre` that fit in another order only: sides exchanged, or as fx, cx, fy, cy.
-
-    order: how the sides were given.
-    """
-    if not rows:
-        return
-    given = f"fx, fy, cx, cy = {rows[0]}"
-    is_file = order == "(width, height)"
-    sides = size[::-1] if is_file else size
-    how = "Write image_width and image_height" if is_file else "Exchange OpenCV's (width, height)"
-    if all(_off_centre(cx, cy, size[::-1]) <= _NEAR for _, _, cx, cy in rows):
-        warn(
-            f"{owner}: image_size={sides} is taken as {order}, but the principal point of {given} is the "
-            f"middle of {sides[::-1]}. {how}. {_CUT_OUT}"
-        )
-    elif all(
-        _off_centre(fy, cy, size) <= _NEAR and abs(cx - fx) <= _NEAR * fx and abs(fy - fx) > _CENTRED * fx
-        for fx, fy, cx, cy in rows
-    ):
-        warn(
-            f"{owner}: {given} have their principal point far from the middle of images of {size}, and seem to be "
-            f"fx, cx, fy, cy. Pass both focal lengths first. {_CUT_OUT}"
-        )
-    elif all(20 * max(fx, fy) < min(size) and max(abs(cx - 0.5), abs(cy - 0.5)) < 0.2 for fx, fy, cx, cy in rows):
-        warn(
-            f"{owner}: {given} seem to be parts of the image's width and height. Multiply fx and cx by the width, "
-            "fy and cy by the height, and subtract 0.5 from cx and cy"
-        )
-
-
-def warn_of_size(rows: Rows, size: tuple[int, int], owner: str) -> None:
-    """Warn of rows `off_centre` that seem to be of larger or of smaller images than those of `size`."""
-    offs = [((cx + 0.5) / size[1] - 0.5, (cy + 0.5) / size[0] - 0.5) for _, _, cx, cy in rows]
-    if not rows or not (all(min(off) > _FAR for off in offs) or all(max(off) < -_FAR for off in offs)):
-        return
-    cx, cy = rows[0][2:]
-    known = [(int(a), int(b)) for a, b in (text.split("x") for text in _SIZES.split())]
-    its = min(known + [size[::-1] for size in known], key=lambda size: _off_centre(cx, cy, size))
-    its = its if _off_centre(cx, cy, its) < _NEAR / 2 else (16 * round(cy / 8), 16 * round(cx / 8))
-    if min(its) >= _SIZE_LIKE:
-        warn(
-            f"{owner}: fx, fy, cx, cy = {rows[0]} have their principal point far from the middle of images of {size}, "
-            f"and seem to be of images of about (height, width) = {its}. Pass image_size={its}, then scale that camera "
-            f"by .resize{size}. {_CUT_OUT}"
-        )
-
-
-def warn_of_exchange(old: tuple[int, int], new: tuple[int, int], owner: str, how: str = "stretched") -> None:
-    """Warn of a new size that has the shape of the old one on its side, as (width, height) would."""
-    turned = new[0] * old[0] / (new[1] * old[1])
-    if old[0] != old[1] and abs(turned - 1) < _CENTRED / 10:
-        warn(
-            f"{owner}: an image of (height, width) = {old} is {how} to {new}; it would keep its shape as "
-            f"{new[::-1]}. For the image on its side use camera.rot90"
-        )
-
-
-def _off_centre(cx: float, cy: float, size: tuple[int, int]) -> float:
-    """Return the distance of a point from the middle of an image, the larger of the parts of its height and width."""
-    height, width = size
-    return max(abs(cx - (width - 1) / 2) / width, abs(cy - (height - 1) / 2) / height)

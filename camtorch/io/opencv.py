@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import torch
 
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.numbers import off_centre, warn_of_order, warn_of_size
+from camtorch.cameras.image_sizes import off_centre, warn_of_order, warn_of_size
 from camtorch.cameras.rig import Rig
 from camtorch.io import poses
 from camtorch.io.parsing import parse_mapping, read_bytes

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.numbers import warn_of_exchange
+from camtorch.cameras.image_sizes import warn_of_exchange
 from camtorch.models import UCM, Cylindrical, Equirectangular, Pinhole
 from camtorch.poses.rotations import as_rotation
 from camtorch.rays.lattices import around_ends, image_lattice
