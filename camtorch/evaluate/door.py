@@ -121,7 +121,7 @@ def is_constant(module: nn.Module) -> bool:
     if not records_constants():
         return False
     for part in module.modules():
-        own = part.__dict__.get("_own", {})
+        own = part.__dict__.get("_untraced", {})
         for name, tensor in (*part._parameters.items(), *part._buffers.items()):
             known = own.get(name)
             if tensor is None or tensor is known:

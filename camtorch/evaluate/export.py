@@ -155,7 +155,7 @@ def with_values(module: nn.Module) -> Iterator[None]:
     """Suspend tracing in here, and give a module that `is_constant` its own tensors, to make constants from."""
     places: list[tuple[dict[str, Any], str, Tensor]] = []
     for part in module.modules():
-        own = part.__dict__.get("_own", {})
+        own = part.__dict__.get("_untraced", {})
         places += [(tensors, name, own[name]) for tensors in (part._parameters, part._buffers) for name in tensors]
     traced = [tensors[name] for tensors, name, _ in places]
     with set_aside():

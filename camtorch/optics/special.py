@@ -39,7 +39,10 @@ def _blend(
     in_near: tuple[float, ...],
     in_far: tuple[float | None, ...],
 ) -> Tensor:
-    """Return `near` of planes where they are small, else `far`; each sees numbers, or None: the plane, elsewhere."""
+    """Return `near` of planes where they are small, else `far`.
+
+    `in_near` and `in_far`: harmless inputs where the other branch counts; None leaves the plane.
+    """
     looks = may_look_at(small, *planes) and small.numel() > _MANY
     places = small.nonzero(as_tuple=True) if looks else ()
     if looks and not len(places[0]):

@@ -92,7 +92,7 @@ def movement(camera: CameraLike, distortion: Tensor, nominal: Tensor, lattice: i
     )
     pixels = _over(size, lattice).to(k.device).expand(len(k), -1, -1)
     rays, seen = remade(camera, intrinsics=intrinsics, distortion=k).unproject(pixels)
-    # each coefficient less, then each more; the same lenses stand before any part of an image
+    # each coefficient less, then each more; the bits do not depend on the image's part
     change = _STEP * torch.eye(count, dtype=torch.float64, device=k.device)
     lenses, _ = defined_or(camera, k[:, None] + torch.cat((-change, change)), k[:, None])
     many = [t.repeat_interleave(2 * count, 0) for t in (intrinsics, rays)]

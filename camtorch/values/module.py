@@ -26,13 +26,20 @@ def typed_as(forward: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable
     return lambda call: call
 
 
-_BARE = nn.Module().__dict__
-_KINDS = {"_own": dict, **{name: type(value) for name, value in _BARE.items() if isinstance(value, (dict, set))}}
+# Each sample makes cameras and reads their tensors many times, and torch's ways take longer than the arithmetic on a
+# few points: `nn.Module.__setattr__` looks through three dicts, `__getattr__` runs after a search of the class. So
+# `GeometryModule` and `remade` fill a module's dict by themselves, and the properties `Camera.intrinsics` and
+# `Warp.source` read it. Only torch.compile gets torch's ways, as it follows no other.
+
+_BARE = nn.Module().__dict__  # the state of a module without attributes
+_CONTAINERS = {name: type(value) for name, value in _BARE.items() if isinstance(value, (dict, set))}
+_CONTAINERS["_untraced"] = dict
+_RENAMED = {"_own": "_untraced", "_warned": "_expects_unusable"}  # attributes of older pickles
 
 
-def _containers() -> dict[str, Any]:
-    """Return the empty dicts and sets of a new module."""
-    return dict(zip(_KINDS, map(operator.call, _KINDS.values()), strict=True))  # no loop of Python
+def _new_containers() -> dict[str, Any]:
+    """Return the empty dicts and sets of a new module, in no loop of Python."""
+    return dict(zip(_CONTAINERS, map(operator.call, _CONTAINERS.values()), strict=True))
 
 
 class UnsharedState(nn.Module):
@@ -54,18 +61,18 @@ class UnsharedState(nn.Module):
 class GeometryModule(UnsharedState):
     """A module whose tensors are geometry: Parameters, or tensors of a graph, in at least float32."""
 
-    _own: dict[str, Tensor | None]  # the tensors that were registered, also while tracing replaces them
+    _untraced: dict[str, Tensor | None]  # the true tensors: export puts fakes into `_parameters` and `_buffers`
 
     def __init__(self, modules: Mapping[str, nn.Module | None] = MappingProxyType({}), /, **attributes: Any):
         """Set these attributes, which are no modules, and these parts."""
-        if torch.compiler.is_compiling():  # the compiler follows only torch's way, which takes 1 us an attribute
+        if torch.compiler.is_compiling():
             super().__init__()
             for name, value in (*modules.items(), *attributes.items()):
                 setattr(self, name, value)
         else:
             state = self.__dict__
             state.update(_BARE, **attributes)
-            state.update(_containers())
+            state.update(_new_containers())
             parts = state["_modules"]
             for name, module in modules.items():
                 (state if module is None else parts)[name] = module
@@ -81,7 +88,7 @@ class GeometryModule(UnsharedState):
     def _note(self, name: str) -> None:
         if not torch.compiler.is_compiling():
             # a new dict, because this module and the one that it was copied from may share the old one
-            self.__dict__["_own"] = {**self.__dict__.get("_own", {}), name: getattr(self, name)}
+            self.__dict__["_untraced"] = {**self.__dict__.get("_untraced", {}), name: getattr(self, name)}
 
     def hold(self, name: str, value: Tensor, shape: tuple[int, ...]) -> None:
         """Register plain values as a new Parameter of `shape`, and a Parameter, or a tensor of a graph, as it is."""
@@ -105,7 +112,7 @@ class GeometryModule(UnsharedState):
                 self.register_buffer(name, tensor, persistent)
             return
         state = self.__dict__
-        state["_parameters" if is_learnt else "_buffers"][name] = state["_own"][name] = tensor
+        state["_parameters" if is_learnt else "_buffers"][name] = state["_untraced"][name] = tensor
         if persistent or is_learnt:
             state["_non_persistent_buffers_set"].discard(name)
         else:
@@ -167,8 +174,12 @@ class GeometryModule(UnsharedState):
         state["_buffers"] = {
             name: b if b is None or b.is_leaf else b.detach().requires_grad_() for name, b in self._buffers.items()
         }
-        state["_own"] = {**self._parameters, **state["_buffers"]}
+        state["_untraced"] = {**self._parameters, **state["_buffers"]}
         return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        state = {_RENAMED.get(name, name): value for name, value in state.items()}
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
 
 
 class BatchedModule(GeometryModule):
@@ -287,22 +298,22 @@ def remade(module: Made, learns: bool = False, /, **changes: Any) -> Made:
     tensors = {name: changes.pop(name) if name in changes else getattr(module, name) for name in module.tensor_names}
     made: Made
     if torch.compiler.is_compiling() and "image_size" in module.__dict__:
-        # the compiler follows a constructor, but no way without one
+        # the compiler follows a constructor
         numbers = [fixed(tensor) for tensor in tensors.values() if tensor.shape[-1]]
         made = model(*numbers, image_size=changes.get("image_size", module.image_size))
     else:
         made = model.__new__(model)
         state = made.__dict__
         state.update(module.__dict__, _is_full_backward_hook=None, **changes)
-        state.update(_containers())
+        state.update(_new_containers())
         for name in module.memo_names:
             state[name] = Kept.__new__(Kept)  # without a call of Python
-        parameters, own = state["_parameters"], state["_own"]
+        parameters, untraced = state["_parameters"], state["_untraced"]
         for name, tensor in tensors.items():
             if not tensor.shape[-1]:
                 made.put(name, tensor.detach() if tensor.requires_grad else tensor)
             elif type(tensor) is nn.Parameter or is_parameter(tensor := fixed(tensor)):  # most are one
-                parameters[name] = own[name] = tensor
+                parameters[name] = untraced[name] = tensor
             else:
                 made.put(name, _widen(tensor))
     for name in module.tensor_names if learns else ():

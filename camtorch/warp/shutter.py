@@ -128,7 +128,7 @@ class RollingShutter(GeometryModule):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         _check_exposure(state["_buffers"].pop("exposure", None))
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        super().__setstate__(state)
 
     def extra_repr(self) -> str:
         readout, rates = map(values_of, (self.readout, self.rates))

@@ -330,7 +330,7 @@ class Warp(CameraPair):
         lost = [name for name in ("shutter", "target_shutter") if state["_modules"].get(name) is not None]
         if lost and not self._has_shutters:
             raise ValueError(f"{type(self).__name__}: a saved warp must have no {lost[0]}; got one of 0.3. {LEFT}")
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        super().__setstate__(state)
 
     def extra_repr(self) -> str:
         """Return the options, then "learns" if a camera or the rotation requires grad, else "fixed"."""
