@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -40,8 +40,8 @@ except Exception as error:  # a binary that does not match fails with a RuntimeE
     ) from error
 
 _OWNER = "torchvision.Transform"
-_KINDS = {PIL.Image.Image: "image", tv_tensors.Image: "image", tv_tensors.Video: "image", tv_tensors.Mask: "mask"}
-_KINDS |= {tv_tensors.BoundingBoxes: "boxes", tv_tensors.KeyPoints: "keypoints"}
+_BY_TYPE = {PIL.Image.Image: "image", tv_tensors.Image: "image", tv_tensors.Video: "image", tv_tensors.Mask: "mask"}
+_BY_TYPE |= {tv_tensors.BoundingBoxes: "boxes", tv_tensors.KeyPoints: "keypoints"}
 _HELD = Tensor, np.ndarray
 
 
@@ -106,38 +106,33 @@ class Transform(FrontEnd, v2.Transform):
         flat, spec = pytree.tree_flatten_with_path(given)
         paths, leaves = [path for path, _ in flat], [leaf for _, leaf in flat]
         names = [_name(path) for path in paths]
-        keys, fields, sizes = list(names), {}, []
-        if len(set(names)) < len(names):
-            places = (
-                pytree.keystr(path[:-1] if path and isinstance(path[-1], pytree.MappingKey) else path) for path in paths
-            )
-            keys = [f"{place}/{name}" for place, name in zip(places, names, strict=True)]
-        for i, kind in self._kinds(flat, names).items():
-            fields[i], size = _native(names[i], leaves[i], kind), getattr(leaves[i], "canvas_size", None)
-            if size or kind in IMAGES:
-                sizes.append((type(leaves[i]).__name__, tuple(size or fields[i][1].shape[-2:])))
+        keys = names if len(set(names)) == len(names) else [f"{_place(path)}/{_name(path)}" for path in paths]
+        fields = {i: _read_leaf(names[i], leaves[i], kind) for i, kind in self._kinds(flat, names).items()}
+        sizes = []
+        for i, (kind, value, _) in fields.items():
+            size = getattr(leaves[i], "canvas_size", None) or (value.shape[-2:] if kind in IMAGES else ())
+            sizes += [(type(leaves[i]).__name__, tuple(size))] if size else []
         cameras = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Camera)]
         if len(cameras) > 1:
             raise ValueError(f"{_OWNER}: a sample must have one camera; got {len(cameras)}")
-        own = self.augmentation
+        augmentation, given_camera = self.augmentation, leaves[cameras[0]] if cameras else self.camera
         matrix = next(((keys[i], value) for i, (kind, value, _) in fields.items() if kind == "K"), None)
-        given_camera = leaves[cameras[0]] if cameras else self.camera
-        camera = camera_of_sample(_OWNER, own, given_camera, sizes, matrix)
-        kinds = {keys[i]: kind or KEEP for i, (kind, _, _) in fields.items()}
+        camera = camera_of_sample(_OWNER, augmentation, given_camera, sizes, matrix)
+        is_guessed = matrix is None and isinstance(known_camera(given_camera, augmentation.camera), Guess)
+        kinds = {keys[i]: field.kind or KEEP for i, field in fields.items()}
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
-        sample = Frames({keys[i]: value for i, (_, value, _) in fields.items()}, camera=detached(camera))
-        guessed = matrix is None and isinstance(known_camera(given_camera, own.camera), Guess)
+        sample = Frames({keys[i]: field.value for i, field in fields.items()}, camera=detached(camera))
 
         def write(moved: Sample, change: Change) -> Any:
-            for i, (kind, _, back) in fields.items():
-                if change.parts[0].moves is not None or not kind or type(leaves[i]) in _HELD:
-                    leaves[i] = back(moved[keys[i]], change)
+            for i, field in fields.items():  # where nothing moves, PIL images and tv_tensors stay as they are
+                if change.parts[0].moves is not None or not field.kind or type(leaves[i]) in _HELD:
+                    leaves[i] = field.write(moved[keys[i]], change.parts[0].image_size)
             for i in cameras:
                 leaves[i] = moved["camera"]
             result = pytree.tree_unflatten(leaves, spec)
-            if own.place and isinstance(result, dict):
+            if augmentation.place and isinstance(result, dict):
                 result[PLACE] = moved[PLACE]
-            if guessed and isinstance(result, dict):
+            if is_guessed and isinstance(result, dict):
                 result["camera"] = moved["camera"]
             for i in fields if self.valid else ():
                 path, valid = paths[i], moved.get(f"{keys[i]}_valid")
@@ -160,7 +155,7 @@ class Transform(FrontEnd, v2.Transform):
             whole_path = (d for d, step in enumerate(reversed(path)) if not isinstance(step, pytree.SequenceKey))
             lists = 0 if getattr(leaf, "ndim", 0) else next(whole_path, len(path) - 1)
             value = functools.reduce(lambda held, _: [held], range(lists), leaf)
-            kinds[i] = next((kind for of, kind in _KINDS.items() if isinstance(leaf, of)), None)
+            kinds[i] = next((kind for of, kind in _BY_TYPE.items() if isinstance(leaf, of)), None)
             try:
                 if isinstance(leaf, PIL.Image.Image) and kind_of(name, [leaf], fields, _OWNER) == "mask":
                     kinds[i] = "mask"
@@ -184,38 +179,81 @@ def _name(path: Any) -> str:
     return next((word for word in reversed(words) if isinstance(word, str)), pytree.keystr(path) or "[0]")
 
 
-def _native(name: str, leaf: Any, kind: str | None) -> tuple[str | None, Any, Callable[[Any, Change], Any]]:
-    """Return the kind and the value of a leaf for the native call, and a function that makes a leaf of the result."""
+def _place(path: Any) -> str:
+    """Return where a leaf is, in front of its name: names may be there twice."""
+    return pytree.keystr(path[:-1] if path and isinstance(path[-1], pytree.MappingKey) else path)
+
+
+class _Leaf(NamedTuple):
+    """A leaf of a nest that may move."""
+
+    kind: str | None  # None: it may be a flag or an order of landmarks
+    value: Any  # as the augmentation takes it
+    write: Callable[[Any, tuple[int, int]], Any]  # (moved value, size of the new image) -> leaf like the given one
+
+
+def _read_leaf(name: str, leaf: Any, kind: str | None) -> _Leaf:
+    """Read an image of PIL or numpy, another array, a flag or an order, a tensor, points, or boxes, in this order."""
     if not isinstance(leaf, Tensor) and kind in IMAGES:
-        value, restored = as_planes_of(leaf, name, _OWNER)
-        return kind, value, lambda new, change: restored(new)
-    if not isinstance(leaf, Tensor) or not kind:
+        planes, restored = as_planes_of(leaf, name, _OWNER)
+        return _Leaf(kind, planes, lambda moved, size: restored(moved))
+    if not isinstance(leaf, Tensor):
         value = as_tensor(leaf, name, kind, _OWNER) if kind else leaf
-        return kind, value, lambda new, change: new if isinstance(leaf, Tensor) else np.asarray(new)
-    lacking, form, canvas = KINDS[kind].dims - leaf.ndim, getattr(leaf, "format", None), hasattr(leaf, "canvas_size")
-    value, whole, edge = leaf.as_subclass(Tensor)[(None,) * lacking], not leaf.is_floating_point(), 0.5 if form else 0.0
-    if form is not None and value.shape[-1] > 4:
+        return _Leaf(kind, value, lambda moved, size: np.asarray(moved))
+    if not kind:
+        return _Leaf(kind, leaf, lambda moved, size: moved)
+    lacking = KINDS[kind].dims - leaf.ndim  # of a single point, box or plane
+    rows: Tensor = leaf.as_subclass(Tensor)[(None,) * lacking]
+    if not isinstance(leaf, (tv_tensors.KeyPoints, tv_tensors.BoundingBoxes)):
+
+        def write(moved: Tensor, size: tuple[int, int]) -> Any:
+            plain = moved[(0,) * lacking]
+            is_plain = not isinstance(leaf, tv_tensors.TVTensor)
+            return plain if is_plain else tv_tensors.wrap(plain.to(leaf.dtype), like=leaf)
+
+        return _Leaf(kind, rows, write)
+    numbers = rows if rows.dtype == torch.float64 else rows.float()
+    pixels, numbers_of = _read_points(numbers) if kind == "keypoints" else _read_boxes(numbers, leaf, name)
+
+    def write_on_canvas(moved: Tensor, size: tuple[int, int]) -> Any:
+        numbers = numbers_of(moved)[(0,) * lacking]
+        numbers = numbers if leaf.is_floating_point() else numbers.round()
+        return tv_tensors.wrap(numbers.to(leaf.dtype), like=leaf, canvas_size=size)
+
+    return _Leaf(kind, pixels, write_on_canvas)
+
+
+def _read_points(given: Tensor, centre: float = 0.0) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    """Return pixels of points, or of boxes' corners, and the function that makes such numbers of moved ones.
+
+    Rows of -1 have no place: they are NaN. centre: of the first pixel, in the given numbers.
+    """
+
+    def numbers_of(moved: Tensor) -> Tensor:
+        lost = ((moved == -1) | moved.isnan()).all(-1, keepdim=True)
+        return torch.where(lost, -1.0, moved + centre)
+
+    return torch.where((given == -1).all(-1, keepdim=True), torch.nan, given - centre), numbers_of
+
+
+def _read_boxes(given: Tensor, leaf: Any, name: str) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    """Return pixels x1, y1, x2, y2 of numbers of a leaf's format, and the function that makes such numbers of them."""
+    form, corners_form = leaf.format, tv_tensors.BoundingBoxFormat.XYXY
+    is_whole, convert = not leaf.is_floating_point(), v2.functional.convert_bounding_box_format
+    if given.shape[-1] > 4:
         raise ValueError(
             f"{_OWNER}: {name} must be boxes without rotation; got BoundingBoxes of the format {form.value}. To move "
             "them, pass their corners as keypoints"
         )
-    if canvas:
-        value = value if value.dtype == torch.float64 else value.float()
-        if form is not None:
-            value = v2.functional.convert_bounding_box_format(value, form, tv_tensors.BoundingBoxFormat.XYXY)
-            value = value.trunc() if whole else value  # as torchvision reads whole numbers
-        value = torch.where((value == -1).all(-1, keepdim=True), torch.nan, value - edge)
+    corners = convert(given, form, corners_form)
+    pixels, corners_of = _read_points(corners.trunc() if is_whole else corners, 0.5)  # as torchvision reads whole ones
 
-    def back(new: Tensor, change: Change) -> Any:
-        if canvas:
-            new = torch.where(((new == -1) | new.isnan()).all(-1, keepdim=True), -1.0, new + edge)
-        if form is not None:
-            if whole:  # rounding errors are no reason for another pixel
-                low, high = (new[..., :2] + 1e-3).floor(), (new[..., 2:] - 1e-3).ceil()
-                new = torch.cat((low, high + (high - low) % 2 if form.value == "CXCYWH" else high), -1)
-            new = v2.functional.convert_bounding_box_format(new, tv_tensors.BoundingBoxFormat.XYXY, form)
-        new = (new.round() if whole and canvas else new)[(0,) * lacking]
-        size = {"canvas_size": change.parts[0].image_size} if canvas else {}
-        return tv_tensors.wrap(new.to(leaf.dtype), like=leaf, **size) if isinstance(leaf, tv_tensors.TVTensor) else new
+    def numbers_of(moved: Tensor) -> Tensor:
+        new = corners_of(moved)
+        if is_whole:  # rounding errors are no reason for another pixel
+            low, high = (new[..., :2] + 1e-3).floor(), (new[..., 2:] - 1e-3).ceil()
+            new = torch.cat((low, high + (high - low) % 2 if form.value == "CXCYWH" else high), -1)
+        converted: Tensor = convert(new, corners_form, form)
+        return converted
 
-    return kind, value, back
+    return pixels, numbers_of
