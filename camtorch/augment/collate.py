@@ -2,7 +2,12 @@
 
 Workers send them in shared memory that is used again or, if small, within the message. Memory that is new to a process
 takes as long to get as images take to be augmented; and every tensor that torch sends has a file of its own, for which
-the other process has to ask.
+the other process has to ask. This is the life of a block of such memory:
+
+* Idle: no process has a tensor in it.
+* Held: a batch of this process lies in it; once it is sent, the block's last byte says that another process has it.
+* Away: the batch died here; the other process may still have its tensor, which sets the byte again when it dies.
+* Idle again; or lost, if one of both processes has forked meanwhile, since the fork has the tensor for good.
 """
 
 from __future__ import annotations
@@ -32,7 +37,9 @@ _SMALL = 1 << 16
 """Bytes below which a tensor goes within the message."""
 _MOST = 32
 """Blocks that wait, and blocks that others have: for those who keep more batches than that, memory is torch's own."""
-_HOME, _AWAY, _LOST = 0, 1, 2
+_HOME = 0  # the last byte of a block: this process may use it again
+_AWAY = 1  # another process has it
+_LOST = 2  # a fork has it for good
 
 
 def collate(samples: Sequence[object]) -> object:
@@ -72,7 +79,15 @@ def _arrays(batch: Sequence[np.ndarray], *, collate_fn_map: Any = None) -> Tenso
 
 
 def _others(function: Callable[..., Any], batch: Sequence[Any], *, collate_fn_map: Any = None) -> Any:
-    return _within_message(function(batch, collate_fn_map=collate_fn_map))
+    """Return values collated by torch's `function`, in a worker so that small tensors go by value."""
+    value = function(batch, collate_fn_map=collate_fn_map)
+    if not in_worker():
+        return value
+    if _is_plain(value):
+        return value.as_subclass(_Sent)
+    if isinstance(value, nn.Module):
+        ForkingPickler.register(type(value), lambda module: (pickle.loads, (pickle.dumps(module),)))
+    return value
 
 
 class _Sent(Tensor):
@@ -88,7 +103,7 @@ class _Sent(Tensor):
 
 
 class _Block:
-    """Shared memory, whose last byte is set if another process has it, or has had it before a fork."""
+    """Shared memory; see the module."""
 
     def __init__(self, size: int):
         self.size, self.forks = size, _forks
@@ -98,7 +113,7 @@ class _Block:
         self.memory = _mapped(os.getpid(), self.file, size)
 
     def back(self, place: int) -> None:
-        """Take a block back of which no tensor of this process is left."""
+        """Take the block back, since its batch died."""
         del _held[place]
         _away.append(self)
 
@@ -110,17 +125,6 @@ _away: list[_Block] = []
 _idle: list[_Block] = []
 _lock = threading.Lock()  # of the lists; `back` goes without it: a tensor may die wherever Python collects garbage
 _forks = 0
-
-
-def _within_message(value: Any) -> Any:
-    """Return a worker's message, with small tensors by value; elsewhere return it as it is."""
-    if not in_worker():
-        return value
-    if _is_plain(value):
-        return value.as_subclass(_Sent)
-    if isinstance(value, nn.Module):
-        ForkingPickler.register(type(value), lambda module: (pickle.loads, (pickle.dumps(module),)))
-    return value
 
 
 def _is_plain(value: Any) -> bool:
