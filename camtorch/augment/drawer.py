@@ -16,7 +16,7 @@ from camtorch.augment.change import LazyWarp, Part
 from camtorch.augment.devices import twin_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.jitter import jittered
-from camtorch.augment.native_draws import Start
+from camtorch.augment.native_draws import Start, Wanted
 from camtorch.augment.presets import PRESETS
 from camtorch.augment.ranges import Range, RangeLike, as_range
 from camtorch.cameras.camera import Camera
@@ -214,12 +214,11 @@ class CameraDrawer(Augmentation):
             return None
 
         def start() -> Start | None:
-            if not Start.draws(values.keys() - self.beside_the_camera - {"lens"}):
-                return None  # a subclass has a range of its own
+            names = values.keys() - self.beside_the_camera - {"lens"}
             base, sized, reach = self._base(source.detach().clone(), values.get("lens"))
-            moves, size = "distortion" in values and base.distortion.shape[-1] > 0, self._size_of(source)
-            nominal = self._nominal(base, sized, size, values) if moves else None
-            return Start.of(source, base, sized, reach, size, [*values], nominal, share)
+            jitters, size = "distortion" in values and base.distortion.shape[-1] > 0, self._size_of(source)
+            nominal = self._nominal(base, sized, size, values) if jitters else None
+            return Start.of(Wanted(source, base, sized, reach, size, names, nominal, share))
 
         if self._is_real:
             found = start()

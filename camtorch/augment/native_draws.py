@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence, Set
 from ctypes import addressof, c_double, c_float
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -32,6 +32,9 @@ _KINDS = {"yaw": structs.YAW, "pitch": structs.PITCH, "roll": structs.ROLL, "zoo
 _KINDS |= {"focal": structs.FOCAL, "centre": structs.CENTRE, "distortion": structs.DISTORTION, "crop": structs.CROP}
 _KINDS["place"] = structs.PLACE
 _TURNS = {"yaw", "pitch", "roll"}
+# C writes the intrinsics of all cameras, then their rotations, their coefficients, and the rest of their lenses
+_TO_ROTATION = 4  # how many numbers of a camera come before its rotation
+_TO_COEFFICIENTS = _TO_ROTATION + 9
 
 
 @lru_cache(maxsize=64)
@@ -40,20 +43,28 @@ def _array(kind: type[c_double | c_float], count: int) -> Any:
     return kind * count
 
 
+class Wanted(NamedTuple):
+    """What new cameras are made of, whatever is drawn."""
+
+    source: Camera  # the camera before
+    base: Camera  # whose lens the new ones have, single or (B,)
+    sized: Tensor  # (4,) or (B, 4) in float64: intrinsics of the base for images of the new size
+    covered_radius: Tensor | None  # of real lenses; see `reach` in `lenses.drawing.Lenses`
+    size: tuple[int, int]  # (height, width) of new images
+    names: Set[str]  # of the values that are drawn
+    nominal: Tensor | None  # intrinsics (*B, 4) of the lens by which coefficients are measured, if they are jittered
+    share: float | None  # of each image that has to be filled, if any has to
+
+
 class Start:
     """Cameras that others are drawn from, as native code takes them; kept for as long as their numbers stay."""
 
-    @staticmethod
-    def draws(names: Set[str]) -> bool:
-        """Whether native code knows all ranges of these names."""
-        return names <= _KINDS.keys()
-
     @classmethod
-    def of(cls, source: Camera, base: Camera, *numbers: Any) -> Start | None:
-        """Return a `Start`; None if native code lacks a model, dtypes differ, or some numbers are no camera's.
-
-        source: the camera before. base: whose lens the new ones have, single or (B,). numbers: see `__init__`.
-        """
+    def of(cls, wanted: Wanted) -> Start | None:
+        """Return a `Start`; None if C lacks a range or a model, dtypes differ, or some numbers are no camera's."""
+        source, base = wanted.source, wanted.base
+        if not wanted.names <= _KINDS.keys():
+            return None
         before, cameras = (
             camera_rows(camera, *[t.expand(*camera.batch_shape, t.shape[-1]) for t in camera.tensors])
             for camera in (source, base)
@@ -62,109 +73,76 @@ class Start:
             return None
         if {t.dtype for t in source.tensors} != {base.intrinsics.dtype}:
             return None
-        return cls(source, before.native, base, cameras.native, *numbers)
+        return cls(wanted, before.native, cameras.native)
 
-    def __init__(
-        self,
-        source: Camera,
-        before: Native,
-        base: Camera,
-        native: Native,
-        sized: Tensor,
-        reach: Tensor | None,
-        size: tuple[int, int],
-        names: Sequence[str],
-        nominal: Tensor | None,
-        share: float | None,
-    ):
-        """Start from intrinsics `sized`, (4,) or (B, 4) in float64, for images of a size.
-
-        reach: see `lenses.drawing.Lenses`. names: of the values that are drawn. nominal: intrinsics (*B, 4) of the lens
-        by which coefficients are measured, if they move. share: of each image that has to be filled, if any has to.
-        """
-        self.before, self.base, self.size, self._native = before, base, size, native
-        self.names: list[str] = [name for name in _KINDS if name in names]
-        self._has_rows = not _SIZES.keys().isdisjoint(names)  # whether some values are several numbers
-        self._share, self._is_flat = share, not isinstance(source, PANORAMAS) and not isinstance(base, PANORAMAS)
-        self._rows = len(sized) if sized.ndim == 2 else native.cameras if base.batch_shape else 0
-        self._turns, self._moves, self._knows = not _TURNS.isdisjoint(names), nominal is not None, False
-        self._kinds = (c_float, np.float32) if native.dtype == torch.float32 else (c_double, np.float64)
-        self._follows = False  # whether new lenses need limits on azimuths
+    def __init__(self, wanted: Wanted, before: Native, native: Native):
+        """Start from the source and the base as native code takes them: `before` and `native`."""
+        source, base, size, names = wanted.source, wanted.base, wanted.size, wanted.names
+        self.base, self._before, self._native, self._size = base, before, native, size
+        self._share, self._is_flat = wanted.share, not isinstance(source, PANORAMAS) and not isinstance(base, PANORAMAS)
+        self._names: list[str] = [name for name in _KINDS if name in names]
+        self._has_lists = not _SIZES.keys().isdisjoint(names)  # whether some values are several numbers
+        self._batch = tuple(wanted.sized.shape[:-1]) or base.batch_shape  # (B,) if each camera has a lens of its own
+        self._types = (c_float, np.float32) if native.dtype == torch.float32 else (c_double, np.float64)
+        self._rotates, self._jitters = not _TURNS.isdisjoint(names), wanted.nominal is not None
+        self._c_makes_lenses = False  # whether C makes those of new coefficients
+        self._needs_limits = False  # whether new lenses of an earlier call needed limits on azimuths
         self._distortion = base.distortion.detach()
         self._coefficients: np.ndarray[Any, Any] = self._distortion.numpy()
         count = self._distortion.shape[-1]
-        call = self._call = structs.Draws(cameras=1, count=count, height=size[0], width=size[1], is_each=self._rows > 0)
+        call = self._call = structs.Draws(cameras=1, count=count, height=size[0], width=size[1])
+        call.is_each = bool(self._batch)
         call.first[:] = [-1] * structs.DRAWN_KINDS
-        at, self._room = 0, 13 + count
-        for name in self.names:
+        at = 0
+        for name in self._names:
             call.first[_KINDS[name]], at = at, at + _SIZES.get(name, 1)
         native.add_table()  # the table of the inverse, for cameras that unproject
         call.base, call.made, call.made.usable = native.pointer, native.struct, None
         call.made.cameras = 1
-        call.sized = self._keep(sized)
-        call.reach = None if reach is None else self._keep(reach.double())
-        if share:
-            call.share, call.source = with_care(share), before.pointer
+        call.sized = self._keep(wanted.sized)
+        call.reach = None if wanted.covered_radius is None else self._keep(wanted.covered_radius.double())
+        if wanted.share:
+            call.share, call.source = with_care(wanted.share), before.pointer
             call.source_height, call.source_width = source.size_for("min_filled")
             call.looked_at = self._keep(looked_at(size, native.dtype))
             before.add_table()
-        if nominal is not None:
-            self._add_coefficients(nominal)
+        self._to_rest = _TO_COEFFICIENTS + count
+        self._room = self._to_rest  # for numbers of a camera; a lens that C makes takes more
+        if wanted.nominal is not None:
+            self._add_coefficients(wanted.nominal)
 
     def _keep(self, tensor: Tensor, *row: int) -> int:
         """Keep a tensor, of each camera if there are several, and return where its numbers lie."""
-        return self._call.keep((tensor.expand(self._rows, *row) if self._rows and row else tensor).contiguous())
+        return self._call.keep((tensor.expand(*self._batch, *row) if self._batch and row else tensor).contiguous())
 
     def _add_coefficients(self, nominal: Tensor) -> None:
         call, base, native, lenses = self._call, self.base, self._native, self._native.lenses
         plan = native.plan
-        measured = measured_once(sensitivity, remade(base, image_size=self.size), base.distortion, nominal)
+        measured = measured_once(sensitivity, remade(base, image_size=self._size), base.distortion, nominal)
         self._sensitivity, call.sensitivity = measured, self._keep(measured, call.count)
         call.coefficients = self._keep(self._distortion, call.count)
-        call.border = self._keep(border(self.size, native.dtype))
+        call.border = self._keep(border(self._size, native.dtype))
         call.made.limits2 = call.made.extent = None
-        if plan.places is None or plan.is_chart or plan.is_long or not base.always_defined:
-            return  # `_tries` makes new lenses instead
+        if plan.places is None or plan.chart_is_inverted or plan.is_long or not base.always_defined:
+            return  # `_candidates` makes new lenses instead
         if plan.has_stages:
-            call.domain = lenses.asked
+            call.domain = lenses.request
             if native.dtype not in plan.fixed_ends:
                 return
             for name, radii in lenses.radii_wanted().items():
                 setattr(call.domain, name, self._keep(radii))
-        self._knows, call.places = True, self._keep(plan.places)
+        self._c_makes_lenses, call.places = True, self._keep(plan.places)
         self._room += plan.parameters + 4 + TABLE_WIDTH
-
-    def _limits(self, call: structs.Draws, rows: int) -> list[Any]:
-        """Allocate limits and extents of new lenses, and return the tensors."""
-        kept = [
-            torch.empty(rows * count, dtype=self._native.dtype, device="cpu")
-            for count in (structs.AZIMUTHS, structs.EXTENT)
-        ]
-        call.made.limits2, call.made.extent = (tensor.data_ptr() for tensor in kept)
-        return kept
 
     def warp(self, values: Mapping[str, Any], base: Camera, options: Options) -> LazyWarp:
         """Return the warp to cameras like `base` of values (B,) and (B, size), or numbers and lists for one."""
-        call, native, names = structs.Draws.from_buffer_copy(self._call), self._native, self.names
-        given: Any = [*map(values.__getitem__, names)]
-        is_one, rows, (of_numbers, dtype) = not self._rows, self._rows or 1, self._kinds
-        if given and isinstance(given[0], np.ndarray):
-            is_one, rows = False, self._rows or len(given[0])
-        if not is_one and given:
-            given = np.concatenate(given, None)
-            call.values = given.ctypes.data
-        elif is_one:
-            if self._has_rows:
-                flat: list[float] = []
-                for value in given:
-                    flat += value if isinstance(value, list) else (value,)
-                given = flat
-            given = _array(c_double, len(given))(*given)
-            call.values = addressof(given)
+        call, native, (number, dtype) = structs.Draws.from_buffer_copy(self._call), self._native, self._types
+        packed, batch = self._packed(values)
+        rows = batch[0] if batch else 1
         # numpy cuts this in half the time of torch
-        room = _array(of_numbers, rows * self._room)()
+        room = _array(number, rows * self._room)()
         numbers = np.frombuffer(room, dtype)
-        call.room = addressof(room)
+        call.values, call.room = addressof(packed), addressof(room)
         if rows != 1:  # as they are one at first
             call.cameras = call.made.cameras = rows
         filled: Sequence[float] = ()
@@ -172,59 +150,76 @@ class Start:
             filled = shares = _array(c_double, 2 * rows)()  # the factors, and what is filled
             call.factors = addressof(shares)
             call.filled = call.factors + 8 * rows
-        tries = self._tries(values, rows, call) if rows and self._moves and not self._knows else None
-        kept: list[Any] = [numbers]
+        candidates = self._candidates(values, call) if rows and self._jitters and not self._c_makes_lenses else None
+        if self._needs_limits:
+            self._add_limits(call)
         run = loaded().camtorch_draws
-        if self._follows:  # an earlier call has needed limits
-            kept += self._limits(call, rows)
         while (left := run(call)) & ~structs.NO_CAMERA:
-            if left & structs.TOO_WIDE:
-                widest = np.max(values["fov"])
-                raise ValueError(
-                    f"fov must be within the reach of a {base.key} lens of these coefficients; got {widest:g} degrees"
-                )
-            if left & structs.LEFT_LENS and tries is not None:
-                tries.follow()
-            elif left & structs.LEFT_LENS:
-                self._follows = True
-                kept += self._limits(call, rows)
-            self._follow(left, call)
-        if self._moves and call.followed < rows:
+            self._complete(left, values, call, candidates)
+        if self._jitters and call.followed < rows:
             call.made.limits2 = call.made.extent = None
-        intrinsics, rotation, k = numbers[: 4 * rows], None, self._coefficients
-        if self._turns:
-            rotation = torch.from_numpy(numbers[4 * rows : 13 * rows].reshape((3, 3) if is_one else (rows, 3, 3)))
-        if self._moves:
-            k = numbers[13 * rows : (13 + call.count) * rows]
-            k = k if is_one else k.reshape(rows, call.count)
-        if not is_one:
-            intrinsics = intrinsics.reshape(rows, 4)
+        intrinsics, rotation, k = numbers[: _TO_ROTATION * rows].reshape(*batch, 4), None, self._coefficients
+        if self._rotates:
+            rotation = torch.from_numpy(numbers[_TO_ROTATION * rows : _TO_COEFFICIENTS * rows].reshape(*batch, 3, 3))
+        if self._jitters:
+            k = numbers[_TO_COEFFICIENTS * rows : self._to_rest * rows].reshape(*batch, call.count)
         made, serves = None, self._is_flat and not left
-        if serves and (self._knows or (not self._moves and native.cameras == rows)):
-            lenses = partial(self._lenses, numbers, rows) if self._knows else lambda _: native.lenses
-            made = Native.made(native, call.made, (call, kept, self), lenses)
-        elif serves and is_one:
+        if serves and (self._c_makes_lenses or (not self._jitters and native.cameras == rows)):
+            # the function keeps the call, of which the struct is a part, and all that this points to
+            made = Native(native.plan, call.made, partial(self._lenses, call, numbers))
+        elif serves and not batch:
             made = single_native(model_of(self.base), torch.from_numpy(intrinsics), torch.from_numpy(k))
-        return LazyWarp(base, intrinsics, k, self.size, rotation, options, self.before, made, filled)
+        return LazyWarp(base, intrinsics, k, self._size, rotation, options, self._before, made, filled)
 
-    def _follow(self, left: int, call: structs.Draws) -> None:
-        """Compute limits and ends that C lacked of the cameras that it starts from."""
+    def _packed(self, values: Mapping[str, Any]) -> tuple[Any, tuple[int, ...]]:
+        """Return drawn values kind after kind, as C takes them, and (B,); () for numbers and lists of one camera."""
+        given: Any = [*map(values.__getitem__, self._names)]
+        if given and isinstance(given[0], np.ndarray):
+            batch = self._batch or (len(given[0]),)
+            given = np.concatenate(given, None)
+            return _array(c_double, len(given)).from_buffer(given), batch
+        if self._has_lists:
+            flat: list[float] = []
+            for value in given:
+                flat += value if isinstance(value, list) else (value,)
+            given = flat
+        return _array(c_double, len(given))(*given), self._batch
+
+    def _complete(self, left: int, values: Mapping[str, Any], call: structs.Draws, candidates: Native | None) -> None:
+        """Compute the limits and ends that C lacked, of new lenses and of the cameras that it starts from."""
+        if left & structs.TOO_WIDE:
+            raise ValueError(
+                f"fov must be within the reach of a {self.base.key} lens of these coefficients; got "
+                f"{np.max(values['fov']):g} degrees"
+            )
+        if left & structs.LEFT_LENS and candidates is not None:
+            candidates.follow()
+        elif left & structs.LEFT_LENS:
+            self._needs_limits = True
+            self._add_limits(call)
         if left & structs.LEFT_BASE:
             self._native.follow()
         if left & structs.LEFT_SOURCE:
-            self.before.follow()
+            self._before.follow()
         if left & structs.LEFT_ENDS:
-            ends = measured_once(lens_ends, remade(self.base, image_size=self.size), self._distortion)
+            ends = measured_once(lens_ends, remade(self.base, image_size=self._size), self._distortion)
             self._call.ends = call.ends = self._keep(ends, *ends.shape[-2:])
 
-    def _tries(self, values: Mapping[str, Any], rows: int, call: structs.Draws) -> Native:
+    def _add_limits(self, call: structs.Draws) -> None:
+        """Allocate limits and extents of new lenses."""
+        call.made.limits2, call.made.extent = (
+            call.keep(torch.empty(call.cameras * count, dtype=self._native.dtype, device="cpu"))
+            for count in (structs.AZIMUTHS, structs.EXTENT)
+        )
+
+    def _candidates(self, values: Mapping[str, Any], call: structs.Draws) -> Native:
         """Make the lenses that native code chooses among, of a model whose domain it does not make by itself."""
         amounts = torch.from_numpy(np.asarray(values["distortion"]).reshape(-1, structs.AMOUNTS))
         steps = (amounts.repeat(1, -(-call.count // structs.AMOUNTS))[:, : call.count] * self._sensitivity)[:, None]
         given = self._distortion.double().reshape(-1, 1, call.count)
         tried = (given + given.new_tensor(structs.JITTER_PARTS)[:, None] * steps).to(self._native.dtype)
         tried, allowed = defined_or(self.base, tried, given.to(tried).expand_as(tried))
-        tried = tried.reshape(rows * len(structs.JITTER_PARTS), call.count)
+        tried = tried.reshape(call.cameras * len(structs.JITTER_PARTS), call.count)
         lenses = CameraRows(model_of(self.base), tried.new_ones(len(tried), 4), tried)
         native = present(lenses.native, "compiled code for lenses like the base")
         native.add_table()
@@ -232,9 +227,16 @@ class Start:
         call.hold((tried, allowed))
         return native
 
-    def _lenses(self, numbers: Any, rows: int, made: Native) -> Lenses:
-        """Return the new lenses with their domains, kept for later cameras with the same coefficients."""
-        model, count = model_of(self.base), self._call.count
-        k = torch.from_numpy(numbers[13 * rows : (13 + count) * rows].reshape(rows, count))
-        domain = partial(domain_for, model, k, False)
-        return lenses_of(made.plan, k, lambda: Lenses.known(made.plan, model.optics, k, domain, made))
+    def _lenses(self, call: structs.Draws, numbers: np.ndarray[Any, Any]) -> Lenses:
+        """Return the lenses of new cameras: those of the base, or new ones, kept for later ones of the same numbers."""
+        if not self._jitters:
+            return self._native.lenses
+        rows, plan, model = call.cameras, self._native.plan, model_of(self.base)
+        k = torch.from_numpy(numbers[_TO_COEFFICIENTS * rows : self._to_rest * rows].reshape(rows, call.count))
+
+        def new() -> Lenses:
+            struct = structs.Cameras.from_buffer_copy(call.made)
+            struct.hold((call, numbers, self))
+            return Lenses(plan, model.optics, k, partial(domain_for, model, k, False), struct)
+
+        return lenses_of(plan, k, new)

@@ -79,7 +79,7 @@ def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[
     """
     cameras, count, _ = points.shape
     by_points = torch.empty(2, cameras, count, 3, dtype=native.dtype, device="cpu")
-    sums = torch.zeros(2, cameras, count, (4 + native.parameters) * by_camera, dtype=torch.float64, device="cpu")
+    sums = torch.zeros(2, cameras, count, (4 + native.plan.parameters) * by_camera, dtype=torch.float64, device="cpu")
     tile = 1 if by_camera else _TILE
     for one, by, to in zip(torch.eye(2, dtype=native.dtype, device="cpu"), by_points, sums, strict=True):
         call = structs.Rows()
@@ -110,7 +110,7 @@ def _vjp(
     results = _empty((cameras, count, size), native.dtype) if size else None
     tiles, sums = -(-count // _TILE), None
     if want_parameters:
-        sums = torch.zeros(cameras, tiles, 4 + native.parameters, dtype=torch.float64, device="cpu")
+        sums = torch.zeros(cameras, tiles, 4 + native.plan.parameters, dtype=torch.float64, device="cpu")
     if results is not None:
         call.results, call.result_strides[:] = results.data_ptr(), results.stride()
     component, *row = cotangents.stride()
@@ -213,7 +213,7 @@ class NativeMove:
         count = pixels.shape[1]
         result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
         valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
-        call, counters = structs.Move.from_buffer_copy(self._move), _kept.counters
+        call, counters = structs.Move.from_buffer_copy(self._move), _per_thread.counters
         call.form, (call.height, call.width), call.count, call.tile = form, self._size, count, _TILE
         call.rows, call.row_strides[:] = address_and_strides(pixels)
         call.results, call.result_strides[:], call.valid = result.data_ptr(), (2 * count, 2, 1), valid.data_ptr()
@@ -262,13 +262,13 @@ def run_and_follow(
                 native.follow()
 
 
-class _Kept(threading.local):
+class _PerThread(threading.local):
     def __init__(self) -> None:
         self.memory: Tensor | None = None
         self.counters = (c_int64 * 2)()
 
 
-_kept = _Kept()
+_per_thread = _PerThread()
 _MOST_KEPT = 1 << 22  # bytes
 
 
@@ -276,10 +276,10 @@ def _kept_memory(count: int) -> Tensor:
     """Return at least `count` bytes: memory that calls of this thread reuse, or new memory if `count` is large."""
     if count > _MOST_KEPT:
         return torch.empty(count, dtype=torch.uint8, device="cpu")
-    if _kept.memory is None or _kept.memory.shape[0] < count:
+    if _per_thread.memory is None or _per_thread.memory.shape[0] < count:
         with torch.inference_mode(False):
-            _kept.memory = torch.empty(count, dtype=torch.uint8, device="cpu")
-    return _kept.memory
+            _per_thread.memory = torch.empty(count, dtype=torch.uint8, device="cpu")
+    return _per_thread.memory
 
 
 def address_and_strides(pixels: Tensor) -> tuple[int, tuple[int, int, int]]:

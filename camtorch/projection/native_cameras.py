@@ -40,17 +40,17 @@ class ModelPlan:
         # the coefficients of the parameters; None if the model computes some
         self.places = torch.tensor(known, device="cpu") if len(known) == len(parameters) else None
         self.is_all = known == list(range(len(coefficients)))
-        self.is_chart = isinstance(chart, optics.Inverted)
+        self.chart_is_inverted = isinstance(chart, optics.Inverted)
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
-        # a radial factor has so many numbers that its fold is not found by a root
+        # a radial factor has more coefficients than C finds roots for
         self.is_long = any(part.factor and part.n + part.m > structs.MOST_DEGREE for part in parts)
         self.fixed_ends: dict[torch.dtype, tuple[float, float]] = {}  # if all cameras have them, after a call of `ends`
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
     def ends(self, chart: Callable[[], Chart], dtype: torch.dtype) -> tuple[float | Tensor, float | Tensor]:
         """Return the radii at which the chart of some cameras ends, and beyond which there are no images."""
-        if self.is_chart:
+        if self.chart_is_inverted:
             return FURTHEST, FURTHEST
         if dtype in self.fixed_ends:
             return self.fixed_ends[dtype]
@@ -85,57 +85,44 @@ _plans = Kept(64)  # keyed by optics and number of coefficients
 class Lenses:
     """The lenses of cameras (C,) in the form of the native geometry: numbers, and their domains as far as known."""
 
-    struct: structs.Cameras
-    """The lenses' part of the struct; pointers that are not set are of values that are not known yet."""
-
     def __init__(
-        self, plan: ModelPlan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool = False
+        self, plan: ModelPlan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], struct: structs.Cameras
     ):
-        self.plan, self.optics_of, self.k = plan, optics_of, k
-        self.slow_domain, self.cameras, self.dtype = domain, len(k), k.dtype
-        self.struct = struct = structs.Cameras()
-        struct.hold(k)
-        struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
-        struct.is_double, struct.cameras = self.dtype == torch.float64, self.cameras
-        if plan.parameters:
-            struct.parameters = self._keep(plan.parameters_of(optics_of, k))
-        if plan.places is None and (constants := _constants(optics_of(columns(k))[1])):
-            struct.constants, struct.constant_count = self._keep_columns(constants), len(constants)
-        if plan.is_chart:
-            # the fold and the inverse of a chart that is defined in the other direction
-            table = torch.empty(self.cameras, TABLE_WIDTH, dtype=self.dtype, device="cpu")
-            struct.chart_safe_radius_sq, struct.chart_table = self._new(1), self._keep(table)
-            wanted = {"safe_radius_sq": struct.chart_safe_radius_sq, "table": struct.chart_table, "is_chart": True}
-            self._ask(wanted)
-            struct.chart_most2 = self._keep(table[:, 1])
-        if plan.has_stages:
-            self._add_domain(tables)
+        """Take the struct of coefficients (C, n), None in it if not known yet; `domain` is for parts that C lacks."""
+        self.plan, self.optics_of, self.k, self.python_domain, self.struct = plan, optics_of, k, domain, struct
 
     @classmethod
-    def known(cls, plan: ModelPlan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], made: Native) -> Lenses:
-        """Return the lenses of cameras that native code made, with their parameters and domains."""
-        lenses = cls.__new__(cls)
-        lenses.plan, lenses.optics_of, lenses.k = plan, optics_of, k
-        lenses.slow_domain, lenses.cameras, lenses.dtype = domain, len(k), k.dtype
-        lenses.struct = structs.Cameras.from_buffer_copy(made.struct)
-        lenses.struct.hold(made.struct)
+    def of(cls, plan: ModelPlan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool) -> Lenses:
+        """Return the lenses of coefficients (C, n), with the table for the inverse if `tables` are sure to be used."""
+        struct = structs.Cameras(cameras=len(k), is_double=k.dtype == torch.float64)
+        struct.hold(k)
+        struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
+        lenses = cls(plan, optics_of, k, domain, struct)
+        if plan.parameters:
+            struct.parameters = lenses._keep(plan.parameters_of(optics_of, k))
+        if plan.places is None and (constants := _constants(optics_of(columns(k))[1])):
+            struct.constants, struct.constant_count = lenses._keep_columns(constants), len(constants)
+        if plan.chart_is_inverted:
+            lenses._add_chart()
+        if plan.has_stages:
+            lenses._add_domain(tables)
         return lenses
 
     def _optics(self) -> tuple[Chart, Lens]:
         return self.optics_of(columns(self.k.double()))
 
     @functools.cached_property
-    def asked(self) -> structs.Domain:
+    def request(self) -> structs.Domain:
         """The request for the domain, with optics in double precision."""
-        made, plan = structs.Domain(), self.plan
+        plan, dtype = self.plan, self.k.dtype
+        made = structs.Domain(is_double=self.struct.is_double, cameras=self.struct.cameras, is_radial=plan.is_radial)
         # parameters that the model computes are computed in double precision
         k = self.k if plan.places is not None else self.k.double()
         parameters = plan.parameters_of(self.optics_of, k) if plan.parameters else k
         made.parts, made.part_count = addressof(plan.parts), plan.count
-        made.is_double, made.cameras, made.is_radial = self.dtype == torch.float64, self.cameras, plan.is_radial
         made.parameters, made.parameter_count = self._keep(parameters.double()), plan.parameters
-        made.most = torch.finfo(self.dtype).max ** 0.25
-        made.ends, made.usual_ends = map(self._keep_ends, plan.ends(lambda: self._optics()[0], self.dtype))
+        made.most = torch.finfo(dtype).max ** 0.25
+        made.ends, made.usual_ends = map(self._keep_ends, plan.ends(lambda: self._optics()[0], dtype))
         if plan.places is None or plan.is_long:
             chart, lens = self._optics()
             if constants := _constants(lens):
@@ -144,37 +131,45 @@ class Lenses:
             if factor is not None:
                 many = len(factor.parameters) > structs.MOST_DEGREE
                 fold = factor.closed_fold() if many and factor.fold is None else factor.fold
-                made.folds = None if fold is None else self._keep(fold.expand(self.cameras, 1))
+                made.folds = None if fold is None else self._keep(fold.expand(self.struct.cameras, 1))
         return made
 
     def _keep_ends(self, end: float | Tensor) -> int:
         if isinstance(end, float):
-            return self.struct.keep(_same_ends(end, self.cameras))
-        return self._keep(end.expand(self.cameras, 1).double())
+            return self.struct.keep(_same_ends(end, self.struct.cameras))
+        return self._keep(end.expand(self.struct.cameras, 1).double())
 
-    def _ask(self, wanted: dict[str, int]) -> None:
+    def _fill(self, wanted: dict[str, int]) -> None:
         """Fill in the wanted parts of the domain: names and addresses."""
-        asked = structs.Domain.from_buffer_copy(self.asked)  # several threads may ask at once
+        request = structs.Domain.from_buffer_copy(self.request)  # several threads may request at once
         for name, place in wanted.items():
-            setattr(asked, name, place)
-        loaded().camtorch_domain(asked)
+            setattr(request, name, place)
+        loaded().camtorch_domain(request)
 
     def _new(self, columns: int) -> int:
-        return self._keep(torch.empty(self.cameras, columns, dtype=self.dtype, device="cpu"))
+        return self._keep(self.k.new_empty(self.struct.cameras, columns))
+
+    def _add_chart(self) -> None:
+        """Set the fold and the inverse of a chart that is defined in the other direction."""
+        struct, table = self.struct, self.k.new_empty(self.struct.cameras, TABLE_WIDTH)
+        struct.chart_safe_radius_sq, struct.chart_table = self._new(1), self._keep(table)
+        wanted = {"safe_radius_sq": struct.chart_safe_radius_sq, "table": struct.chart_table, "is_chart": True}
+        self._fill(wanted)
+        struct.chart_most2 = self._keep(table[:, 1])
 
     def _add_domain(self, tables: bool) -> None:
         plan = self.plan
-        if plan.is_chart:  # its end comes from a search
-            domain = self.slow_domain()
+        if plan.chart_is_inverted:  # its end comes from a search
+            domain = self.python_domain()
             self.struct.image_radius_sq = self._keep(domain.image_radius_sq)
             self.struct.safe_radius_sq = self._keep(domain.safe_radius_sq)
             return
         names = ["safe_radius_sq", "image_radius_sq", *["image_circle_sq", "stagewise"] * plan.has_rest]
         has_table = tables and plan.has_factor  # made now, as pixels will follow
-        start, step = self._new(len(names) + TABLE_WIDTH * has_table), self.cameras * self.dtype.itemsize
+        start, step = self._new(len(names) + TABLE_WIDTH * has_table), self.struct.cameras * self.k.dtype.itemsize
         wanted = {name: start + step * i for i, name in enumerate([*names, *["table"] * has_table])}
         radii = None if plan.is_radial else plan.radii(lambda: self._optics()[0], structs.MOST_RADII, self.k)
-        self._ask(wanted if radii is None else wanted | {"radii": self._keep(radii)})
+        self._fill(wanted if radii is None else wanted | {"radii": self._keep(radii)})
         for name, place in wanted.items():
             setattr(self.struct, name, place)
 
@@ -188,7 +183,7 @@ class Lenses:
         """Return the address of the table for the inverse of the radial factor, made at first use."""
         if self.struct.table is None:
             table = self._new(TABLE_WIDTH)
-            self._ask({"table": table})
+            self._fill({"table": table})
             self.struct.table = table  # set when it is whole, as another thread may be reading
         return int(self.struct.table)
 
@@ -200,9 +195,9 @@ class Lenses:
             known = ((name, getattr(struct, name)) for name in ("image_circle_sq", "stagewise"))
             wanted |= {name: place for name, place in known if place is not None}
             wanted |= {name: self._keep(radii) for name, radii in self.radii_wanted().items()}
-            if self.plan.is_chart:
-                wanted["ends"] = self._keep_ends(self._optics()[0].end(self.dtype))
-            self._ask(wanted)
+            if self.plan.chart_is_inverted:
+                wanted["ends"] = self._keep_ends(self._optics()[0].end(self.k.dtype))
+            self._fill(wanted)
             struct.extent, struct.limits2 = wanted["extent"], wanted["limits2"]
         return struct.limits2, struct.extent
 
@@ -213,19 +208,19 @@ class Lenses:
         if self.plan.has_stages and not self.plan.is_radial:
             self.followed()
         widths = dict.fromkeys(("safe_radius_sq", "image_radius_sq", "image_circle_sq", "stagewise"), 1)
-        made = {}
+        made, count = {}, self.struct.cameras
         for name, width in {**widths, "table": TABLE_WIDTH, "limits2": structs.AZIMUTHS}.items():
             if (place := getattr(self.struct, name)) is not None:
-                dtype = torch.bool if name == "stagewise" else self.dtype
-                memory = (ctypes.c_char * (self.cameras * width * dtype.itemsize)).from_address(place)
-                made[name] = torch.frombuffer(memory, dtype=dtype).view(self.cameras, width).clone()
+                dtype = torch.bool if name == "stagewise" else self.k.dtype
+                memory = (ctypes.c_char * (count * width * dtype.itemsize)).from_address(place)
+                made[name] = torch.frombuffer(memory, dtype=dtype).view(count, width).clone()
         return made
 
     def _keep(self, tensor: Tensor) -> int:
         return self.struct.keep(tensor.contiguous())
 
     def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype | None = None) -> int:
-        return self._keep(torch.cat([c.expand(self.cameras, 1) for c in columns], -1).to(dtype or self.dtype))
+        return self._keep(torch.cat([c.expand(self.struct.cameras, 1) for c in columns], -1).to(dtype or self.k.dtype))
 
 
 @functools.lru_cache(maxsize=16)
@@ -247,29 +242,15 @@ def lenses_of(plan: ModelPlan, k: Tensor, make: Callable[[], Lenses]) -> Lenses:
 class Native:
     """Cameras (C,) of one model in the form of the native geometry."""
 
-    make_lenses: Callable[[Native], Lenses]
-
-    def __init__(self, lenses: Lenses, intrinsics: Tensor, usable: Tensor | None):
-        self.lenses, self.plan, self.struct = lenses, lenses.plan, structs.Cameras.from_buffer_copy(lenses.struct)
-        self.cameras, self.dtype, self.parameters = intrinsics.shape[0], intrinsics.dtype, lenses.plan.parameters
-        self.struct.intrinsics = self.struct.keep(intrinsics.contiguous())
-        self.struct.usable = None if usable is None else self.struct.keep((usable > 0).contiguous())
-        self.pointer = addressof(self.struct)
-
-    @classmethod
-    def made(cls, base: Native, struct: structs.Cameras, room: object, lenses: Callable[[Native], Lenses]) -> Native:
-        """Return cameras that native code made, in `room`, like others; `lenses` makes their lenses at first use."""
-        native = cls.__new__(cls)
-        native.plan, native.dtype, native.parameters = base.plan, base.dtype, base.parameters
-        native.struct, native.cameras, native.pointer = struct, struct.cameras, addressof(struct)
-        native.make_lenses = lenses
-        struct.hold(room)
-        return native
+    def __init__(self, plan: ModelPlan, struct: structs.Cameras, lenses: Callable[[], Lenses]):
+        """Take the cameras' struct, and what returns their lenses; one of both keeps what the struct points to."""
+        self.plan, self.struct, self.pointer, self._find_lenses = plan, struct, addressof(struct), lenses
+        self.cameras, self.dtype = struct.cameras, torch.float64 if struct.is_double else torch.float32
 
     @functools.cached_property
     def lenses(self) -> Lenses:
         """The lenses of the cameras, which other cameras may share."""
-        return self.make_lenses(self)
+        return self._find_lenses()
 
     def add_table(self) -> None:
         """Set the table from which the inverse of a radial factor starts."""
@@ -294,7 +275,11 @@ def native_of(
     plan = _plans((), (optics_of, k.shape[-1]), lambda: _plan_of(optics_of, k))
     if plan is None:
         return None
-    return Native(lenses_of(plan, k, lambda: Lenses(plan, optics_of, k, domain, tables)), intrinsics, usable)
+    lenses = lenses_of(plan, k, lambda: Lenses.of(plan, optics_of, k, domain, tables))
+    struct = structs.Cameras.from_buffer_copy(lenses.struct)
+    struct.intrinsics = struct.keep(intrinsics.contiguous())
+    struct.usable = None if usable is None else struct.keep((usable > 0).contiguous())
+    return Native(plan, struct, lambda: lenses)
 
 
 def _plan_of(optics_of: Optics, k: Tensor) -> ModelPlan | None:
