@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from difflib import get_close_matches
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -14,31 +13,28 @@ from typing_extensions import Unpack
 from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.change import LazyWarp, Part
 from camtorch.augment.devices import twin_of
-from camtorch.augment.filling import enough, scaled
+from camtorch.augment.filling import enough, scaled, tell_of_narrow_images
 from camtorch.augment.jitter import jittered
 from camtorch.augment.native_draws import Start, Wanted
-from camtorch.augment.presets import PRESETS
+from camtorch.augment.presets import REAL, as_like
 from camtorch.augment.ranges import Range, RangeLike, as_range
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.catalogue import ELSEWHERE
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_numbers, hold_numbers, known_false, with_derivatives_of
 from camtorch.lenses.drawing import covering, drawn
-from camtorch.models import MODELS, KannalaBrandt, Pinhole
+from camtorch.models import KannalaBrandt, Pinhole
 from camtorch.native.structs import AMOUNTS
 from camtorch.optics.radial_inverse import precise
 from camtorch.poses.rotations import mount_elements
 from camtorch.rays.lattices import field_of_view
-from camtorch.values.arguments import LEFT, as_image_size, broadcast_shapes, check_degrees, warn
+from camtorch.values.arguments import LEFT, as_image_size, broadcast_shapes, check_degrees
 from camtorch.values.module import remade
-from camtorch.warp.vignetting import vignetting
+from camtorch.warp.vignetting import falloff, vignetting
 from camtorch.warp.warp import Warp
 
 Auto = RangeLike | Literal["auto"] | None
 
-_REAL = "real"
 _TURNS = "yaw", "pitch", "roll"
-_LESS = 0.9  # of the least field of view that was asked for: below that a warning says so
 _TINY, _HUGE = 1e-3, 1e3
 _LIMITS: dict[str, dict[str, Any]] = {
     **{name: {"least": -180, "most": 180} for name in _TURNS},
@@ -57,7 +53,6 @@ _LIMITS: dict[str, dict[str, Any]] = {
 """The options of `as_range` for each range, in the order in which they are drawn."""
 _EXACT = "fov", "crop", "vignetting", "cos4"  # a single number is a range of only that number
 _AUTO = "focal", "centre", "distortion", "crop"
-_told: set[tuple[object, ...]] = set()
 
 
 class LensOptions(EditOptions, total=False):
@@ -105,7 +100,7 @@ class CameraDrawer(Augmentation):
         self.fov = "source" if isinstance(fov, str) and fov == "source" else None
         self._memo = Kept(8)
         self.image_size: tuple[int, int] | None = as_image_size(image_size, self._name)
-        self._is_real = isinstance(like, str) and like == _REAL
+        self._is_real = isinstance(like, str) and like == REAL
         usual = {} if self._is_real else self._usual_ranges
         values = {n: usual.get(n) if n in _AUTO and isinstance(v, str) and v == "auto" else v for n, v in given.items()}
         values |= {"chromatic": chromatic, "vignetting": vignetting, "cos4": cos4}
@@ -133,7 +128,7 @@ class CameraDrawer(Augmentation):
             how = f"Set ranges['fov'] = ct.augment.Range(low, high), or make a new {self._name}"
             raise ValueError(f"{self._name}: fov must be None or 'source', once it is made; got {value!r}. {how}")
         if name == "like":
-            given, value = value, _as_like(value, self._name)
+            given, value = value, as_like(value, self._name)
             if value is not None and self._is_real:
                 got = f"one that was made with 'real'. Make a new {self._name}"
                 raise ValueError(f"{self._name}: like must stay None in {got}; got {given!r:.60}")
@@ -255,41 +250,17 @@ class CameraDrawer(Augmentation):
             cameras += [scaled(target, 1 + beside["chromatic"][..., i]) for i in (0, 1)]
         warp, *others = [Warp.unchecked(source, camera, self.options).turned_by(rotation) for camera in cameras]
         if "vignetting" in beside:
-            # (B or 1, 1, H, W): the loss grows with the square of the distance to that drawn for the farthest corner
-            height, width = target.height, target.width
-            cx, cy = target.intrinsics.detach()[..., 2:].reshape(-1, 2, 1, 1).unbind(1)
-            grid = target.pixel_grid()
-            square = (grid[..., 0] - cx) ** 2 + (grid[..., 1] - cy) ** 2
-            reach = [torch.maximum(c, side - 1 - c) for c, side in ((cx, width), (cy, height))]
-            farthest = (reach[0] ** 2 + reach[1] ** 2).clamp(min=1e-12)
-            light = (1 - beside["vignetting"].reshape(-1, 1, 1) * square / farthest).unsqueeze(1)
+            light = falloff(target, beside["vignetting"])
         if "cos4" in beside:
             natural = vignetting(target, beside["cos4"])
             light = natural if light is None else light * natural
         return Part(source, warp, (others[0], others[1]) if others else None, light)
 
     def _tell_of(self, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor) -> None:
-        """Warn also, once a process, if `min_filled`, and not a draw, zoomed to less than the `fov` asked for."""
         super()._tell_of(source, target, factor, found)
         asked = self._among[0] if self._among else self.ranges["fov"].low if "fov" in self.ranges else None
-        share = self.min_filled or 0.0
-        key = self._name, asked, share
-        if asked is None or key in _told or not known_false(factor <= 1):
-            return
-        zoomed = target()
-        made = _across(zoomed).expand_as(factor)
-        least = torch.minimum(_across(scaled(zoomed, 1 / factor)), torch.full_like(made, asked))
-        # what cannot be filled at all has a warning of its own
-        less = (made < _LESS * least) & (factor > 1) & (found >= share)
-        if not bool(less.any()):
-            return
-        _told.add(key)
-        warn(
-            f"{self._name}: fov must be {asked:g} degrees at least; got an image {float(made[less].min()):.0f} degrees "
-            f"wide: min_filled={share:g} zooms until so much of it is filled, and the camera of the images, "
-            f"{float(source.fov[..., 0].max()):.0f} degrees wide, shows no more in that direction. Pass fov='source' "
-            "for as much as it has, or min_filled=0 to leave the rest empty"
-        )
+        if asked is not None:
+            tell_of_narrow_images(self._name, asked, self.min_filled or 0.0, source, target, factor, found)
 
     def _size_of(self, source: Camera) -> tuple[int, int]:
         return self.image_size or source.size_for(self._name)
@@ -377,27 +348,3 @@ def _as_wide(base: Camera, sized: Tensor, fov: Tensor, width: int) -> Tensor:
 
 
 _ANY = KannalaBrandt([1.0, 1.0, 0.0, 0.0]).detach()
-
-
-def _as_like(like: Camera | str | None, owner: str) -> Camera | None:
-    if like is None or isinstance(like, Camera):
-        if like is not None and like.batch_shape:
-            raise ValueError(f"{owner}: like must be a single camera; got batch dims {tuple(like.batch_shape)}")
-        return like
-    if isinstance(like, str) and like in (*PRESETS, *MODELS):
-        return PRESETS[like].camera() if like in PRESETS else MODELS[like]([1.0, 1.0, 0.0, 0.0]).detach()
-    close = get_close_matches(like, [_REAL, *PRESETS, *MODELS, *ELSEWHERE], 1) if isinstance(like, str) else []
-    raise ValueError(
-        f"{owner}: like must be a Camera, 'real', a preset ({', '.join(PRESETS)}) or a model ({', '.join(MODELS)}); "
-        f"got {like!r}" + (f". Did you mean {ELSEWHERE.get(close[0], close[0])!r}?" if close else "")
-    )
-
-
-def _across(camera: Camera) -> Tensor:
-    """Return the degrees (*B,) from the left to the right edge of the image, at the height of the principal point."""
-    cy = camera.intrinsics[..., 3].detach()
-    u = torch.stack((torch.full_like(cy, -0.5), torch.full_like(cy, camera.width - 0.5)), -1)
-    pixels = torch.stack((u, cy[..., None].expand_as(u)), -1)
-    with torch.no_grad():
-        rays = camera.unproject(pixels.expand(*camera.batch_shape, 2, 2))[0]
-    return torch.atan2(rays[..., 0].abs(), rays[..., 2]).sum(-1).rad2deg()

@@ -10,16 +10,19 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import CameraNumbers, opaque
+from camtorch.evaluate.tensors import known_false
 from camtorch.native.structs import FAR_ZOOM, HALVINGS, LOOKED_AT, MOST_ZOOM, NEARLY_FILLED, SPREAD, TURN_PARTS
 from camtorch.optics.radial_inverse import precise
 from camtorch.poses.rotations import rotation_matrix, rotation_vector
-from camtorch.values.arguments import broadcast_shapes
+from camtorch.values.arguments import broadcast_shapes, warn
 from camtorch.values.module import remade
 from camtorch.warp.boxes import along_edges
 from camtorch.warp.moving import moved_pixels
 
-_ROOT = 1.324717957244746
+_ROOT = 1.324717957244746  # plastic number: a low-discrepancy sequence in 2D (R2)
 _CARE = 0.01  # largest error of the share that points measure
+_LESS = 0.9  # of the least field of view that was asked for: below that a warning says so
+_told: set[tuple[object, ...]] = set()  # what this process has warned of
 
 
 def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
@@ -127,3 +130,39 @@ def _least_zoom(
     if bool((high == most).any()):  # not measured yet
         at_high = torch.where(high == most, part_shown(high), at_high)
     return high, at_high
+
+
+def tell_of_narrow_images(
+    owner: str, fov: float, share: float, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor
+) -> None:
+    """Warn, once a process, if the zoom for `share`, and not a draw, left less than a `fov` that was asked for.
+
+    target: returns the cameras that were zoomed by factors (*B,), and are filled to the parts `found` (*B,).
+    """
+    key = owner, fov, share
+    if key in _told or not known_false(factor <= 1):
+        return
+    zoomed = target()
+    made = _across(zoomed).expand_as(factor)
+    least = torch.minimum(_across(scaled(zoomed, 1 / factor)), torch.full_like(made, fov))
+    # what cannot be filled at all has a warning of its own
+    less = (made < _LESS * least) & (factor > 1) & (found >= share)
+    if not bool(less.any()):
+        return
+    _told.add(key)
+    warn(
+        f"{owner}: fov must be {fov:g} degrees at least; got an image {float(made[less].min()):.0f} degrees "
+        f"wide: min_filled={share:g} zooms until so much of it is filled, and the camera of the images, "
+        f"{float(source.fov[..., 0].max()):.0f} degrees wide, shows no more in that direction. Pass fov='source' "
+        "for as much as it has, or min_filled=0 to leave the rest empty"
+    )
+
+
+def _across(camera: Camera) -> Tensor:
+    """Return the degrees (*B,) from the left to the right edge of the image, at the height of the principal point."""
+    cy = camera.intrinsics[..., 3].detach()
+    u = torch.stack((torch.full_like(cy, -0.5), torch.full_like(cy, camera.width - 0.5)), -1)
+    pixels = torch.stack((u, cy[..., None].expand_as(u)), -1)
+    with torch.no_grad():
+        rays = camera.unproject(pixels.expand(*camera.batch_shape, 2, 2))[0]
+    return torch.atan2(rays[..., 0].abs(), rays[..., 2]).sum(-1).rad2deg()

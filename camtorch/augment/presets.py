@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Literal
 
 import torch
 
 from camtorch.cameras.camera import Camera
+from camtorch.cameras.catalogue import ELSEWHERE
 from camtorch.cameras.operators import fixed_camera
 from camtorch.models import MODELS
 
@@ -29,6 +31,7 @@ class Preset:
         return fixed_camera(MODELS[self.model], *numbers, self.image_size)
 
 
+REAL = "real"  # instead of a name: a lens of `camtorch.lenses`, drawn for each sample
 PresetName = Literal["webcam", "dms60", "dms90", "dms130", "surround190", "tumvi", "aria", "aria_rgb"]
 
 PRESETS: dict[str, Preset] = {
@@ -96,3 +99,18 @@ PRESETS: dict[str, Preset] = {
         "Project Aria glasses, RGB camera, 115 degrees: online calibration in the tests of projectaria_tools",
     ),
 }
+
+
+def as_like(like: Camera | str | None, owner: str) -> Camera | None:
+    """Return a single camera, or that of a preset or a model; None stays None."""
+    if like is None or isinstance(like, Camera):
+        if like is not None and like.batch_shape:
+            raise ValueError(f"{owner}: like must be a single camera; got batch dims {tuple(like.batch_shape)}")
+        return like
+    if isinstance(like, str) and like in (*PRESETS, *MODELS):
+        return PRESETS[like].camera() if like in PRESETS else MODELS[like]([1.0, 1.0, 0.0, 0.0]).detach()
+    close = get_close_matches(like, [REAL, *PRESETS, *MODELS, *ELSEWHERE], 1) if isinstance(like, str) else []
+    raise ValueError(
+        f"{owner}: like must be a Camera, 'real', a preset ({', '.join(PRESETS)}) or a model ({', '.join(MODELS)}); "
+        f"got {like!r}" + (f". Did you mean {ELSEWHERE.get(close[0], close[0])!r}?" if close else "")
+    )

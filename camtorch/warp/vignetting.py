@@ -1,4 +1,4 @@
-"""Natural vignetting: how much less light a lens lets through, the farther a ray is from the axis."""
+"""Vignetting: how much less light a lens lets through, the farther a ray is from the axis."""
 
 from __future__ import annotations
 
@@ -40,3 +40,16 @@ def vignetting(camera: Camera, power: float | Tensor = 1.0) -> Tensor:
             f"{tuple(power.shape)}"
         )
     return cosine ** (4 * power.reshape(-1, 1, 1, 1))
+
+
+def falloff(camera: Camera, loss: Tensor) -> Tensor:
+    """Return the light (B or 1, 1, H, W) of a lens that loses `loss`, (B,) or a number, in the farthest corner.
+
+    The loss grows with the square of the distance from the principal point.
+    """
+    cx, cy = camera.intrinsics.detach()[..., 2:].reshape(-1, 2, 1, 1).unbind(1)
+    grid = camera.pixel_grid()
+    square = (grid[..., 0] - cx) ** 2 + (grid[..., 1] - cy) ** 2
+    across, down = (torch.maximum(c, side - 1 - c) for c, side in ((cx, camera.width), (cy, camera.height)))
+    farthest = (across**2 + down**2).clamp(min=1e-12)
+    return (1 - loss.reshape(-1, 1, 1) * square / farthest).unsqueeze(1)

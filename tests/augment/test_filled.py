@@ -25,7 +25,7 @@ def shares(augmentation, count=24, seed=0, **fields):
 
 @pytest.fixture
 def untold(monkeypatch):
-    monkeypatch.setattr("camtorch.augment.drawer._told", set())
+    monkeypatch.setattr("camtorch.augment.filling._told", set())
 
 
 def test_mostly_empty_images_are_told_once_with_the_number():

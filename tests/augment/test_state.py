@@ -308,14 +308,14 @@ def test_a_call_leaves_no_trace_in_a_pickle(name):
 POINTS = torch.rand(478, 2, generator=torch.Generator().manual_seed(0)) * 40 + 2
 STRIP = camera(size=(SIZE[0], 3 * SIZE[1])).crop(0, 0, *SIZE)  # its axis lies off the image
 WARNINGS = {
-    "fov": ("_tell_of", lambda: A.RandomLens("kannala_brandt", fov=(120, 140), min_filled=0.9), {}),
-    "fov of a preset": ("_tell_of", lambda: A.RandomCamera("dms130", fov=(120, 140), min_filled=0.9), {}),
-    "fov of real lenses": ("_tell_of", lambda: A.RandomLens("real", fov=(120, 140), min_filled=0.9), {}),
+    "fov": ("tell_of_narrow_images", lambda: A.RandomLens("kannala_brandt", fov=(120, 140), min_filled=0.9), {}),
+    "fov of a preset": ("tell_of_narrow_images", lambda: A.RandomCamera("dms130", fov=(120, 140), min_filled=0.9), {}),
+    "fov of real lenses": ("tell_of_narrow_images", lambda: A.RandomLens("real", fov=(120, 140), min_filled=0.9), {}),
     "min_filled": ("_tell_of", lambda: A.RandomCamera("dms130", yaw=1, pitch=1, roll=1, min_filled=0.9), {}),
     "empty": ("tell_of_empty_images", lambda: A.RandomCamera("dms130"), {}),
     "empty, in a chain": ("tell_of_empty_images", lambda: A.Compose([A.VerticalFlip(), A.RandomCamera("dms130")]), {}),
     "fov, in a chain": (
-        "_tell_of",
+        "tell_of_narrow_images",
         lambda: A.Compose([A.HorizontalFlip(), A.RandomLens("kannala_brandt", fov=(120, 140), min_filled=0.9)]),
         {},
     ),
@@ -346,7 +346,7 @@ def test_a_first_sample_of_any_form_warns_once(name, form, monkeypatch):
     image = torch.zeros(*SIZE, 3) if form == "numpy" else torch.zeros(3, *SIZE)
     fields = FORMS[form]({"image": image, **more})
     for is_error in (True, False):
-        monkeypatch.setattr("camtorch.augment.drawer._told", set())
+        monkeypatch.setattr("camtorch.augment.filling._told", set())
         monkeypatch.setattr("camtorch.augment.landmarks._told", set())
         augment = make(20) if make is A.Resize else make()
         augment.camera = STRIP if name == "min_filled" else camera()
