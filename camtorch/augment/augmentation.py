@@ -271,7 +271,9 @@ class Augmentation(SampleTransform):
         return values
 
     def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
-        values = self._values_for(source, draw)
+        return self._part_by_torch(source, self._values_for(source, draw))
+
+    def _part_by_torch(self, source: Camera, values: Mapping[str, Any]) -> Part:
         target, rotation = self._new_camera(source, values)
         if self.min_filled:
             factor, turned, found = enough(source, target, rotation, self.min_filled)

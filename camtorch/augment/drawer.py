@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -51,7 +52,7 @@ _LIMITS: dict[str, dict[str, Any]] = {
     "cos4": {"least": -2, "most": 2},
 }
 """The options of `as_range` for each range, in the order in which they are drawn."""
-_EXACT = "fov", "crop", "vignetting", "cos4"  # a single number is a range of only that number
+_EXACT = "fov", "crop", "vignetting", "cos4"  # a number x of these means (x, x), not a range around nothing
 _AUTO = "focal", "centre", "distortion", "crop"
 
 
@@ -114,8 +115,8 @@ class CameraDrawer(Augmentation):
                 self.ranges[name] = as_range(value, name, self._name, **limit)
         if "fov" in self.ranges:
             check_degrees(self.ranges["fov"].low, fov, self._name)
-        among = self.ranges.pop("fov", None) if self._is_real else None
-        self._among = None if among is None else (among.low, among.high)
+        real = self.ranges.pop("fov", None) if self._is_real else None
+        self._among = None if real is None else (real.low, real.high)  # as states of 0.4 name the fov of real lenses
         self.like = None if self._is_real else like
 
     @property
@@ -140,9 +141,11 @@ class CameraDrawer(Augmentation):
         super().__setattr__(name, value)
 
     @property
-    def drawn_on_host(self) -> bool:  # type: ignore[override]
-        """See `Augmentation`; False for a subclass with a `new_camera` of its own."""
+    def _keeps_formulas(self) -> bool:
+        """Whether new cameras follow from the formulas of this class; a subclass may have another `new_camera`."""
         return type(self).new_camera is CameraDrawer.new_camera
+
+    drawn_on_host = _keeps_formulas
 
     def _like_for(self, source: Camera) -> Camera | None:
         """Return `like`, on the CPU if the source is there and its numbers are known; None without `like`."""
@@ -156,7 +159,7 @@ class CameraDrawer(Augmentation):
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """Return the new camera and its turn, by formulas of torch; see `Augmentation.new_camera`."""
-        base, sized, reach = self._base(source, values.get("lens"))
+        base, sized, covered_radius = self._lens_for(source, values.get("lens"))
         height, width = size = self._size_of(source)
         fx, fy, cx, cy = (_as_wide(base, sized, values["fov"], width) if "fov" in values else sized).unbind(-1)
         for name in ("focal", "zoom"):
@@ -165,8 +168,8 @@ class CameraDrawer(Augmentation):
         if "centre" in values:
             right, down = values["centre"].unbind(-1)
             cx, cy = cx + right * width, cy + down * height
-        if reach is not None:
-            factor = covering(_joined((fx, fy, cx, cy), base.intrinsics), reach, size)
+        if covered_radius is not None:
+            factor = covering(_joined((fx, fy, cx, cy), base.intrinsics), covered_radius, size)
             fx, fy = fx * factor, fy * factor
         distortion = base.distortion
         if "distortion" in values and distortion.shape[-1]:
@@ -188,59 +191,57 @@ class CameraDrawer(Augmentation):
         return target, _joined(elements, source.intrinsics).unflatten(-1, (3, 3))
 
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
-        made = self._lazy_warp(source, values)
-        if made is not None:
-            return made.target, made.rotation
-        if type(self).new_camera is not CameraDrawer.new_camera:
+        if not self._keeps_formulas:
             return super()._new_camera(source, values)
-        like = precise(source.intrinsics.detach())
-        kind: dict[str, Any] = {"dtype": like.dtype, "device": like.device}  # as_tensor makes float32 of floats first
+        example = precise(source.intrinsics.detach())
+        kind: dict[str, Any] = {"dtype": example.dtype, "device": example.device}  # as_tensor makes float32 of floats
         return self.new_camera(source, {name: torch.as_tensor(value, **kind) for name, value in values.items()})
 
-    def _lazy_warp(self, source: Camera, values: Mapping[str, Any], share: float | None = None) -> LazyWarp | None:
+    def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
+        values = self._values_for(source, draw)
+        made = self._lazy_warp(source, values)
+        if made is None:
+            return self._part_by_torch(source, values)
+        if self.min_filled:
+            rows = len(made.filled) // 2
+            factor, found = made.filled[:rows], made.filled[rows:]
+            if min(found, default=1) < self.min_filled or max(factor, default=1) > 1:
+                self._tell_of(source, lambda: made.target, *map(torch.tensor, (factor, found)))
+        may_stay_lazy = made.native is not None and self.options["tolerance"] and not self.options["antialias"]
+        if may_stay_lazy and self.beside_the_camera.isdisjoint(self.ranges):
+            return Part(source, made)
+        return self._part_between(source, made.target, made.rotation, values)
+
+    def _lazy_warp(self, source: Camera, values: Mapping[str, Any]) -> LazyWarp | None:
         """Return the warp of a draw by native code; None if something is recorded, or that lacks a model."""
-        if type(self).new_camera is not CameraDrawer.new_camera:
-            return None
         like = None if self.like is None else self._like_for(source)
         tensors = (source.intrinsics, source.distortion) if like is None else (*source.tensors, *like.tensors)
-        # numbers come where nothing is recorded; without any, it is asked
+        # floats and arrays are drawn only if nothing is recorded; with no range at all, ask
         first = next(iter(values.values()), None)
         if isinstance(first, Tensor) or (first is None and not are_numbers()) or not hold_numbers(tensors):
             return None
-
-        def start() -> Start | None:
-            names = values.keys() - self.beside_the_camera - {"lens"}
-            base, sized, reach = self._base(source.detach().clone(), values.get("lens"))
-            jitters, size = "distortion" in values and base.distortion.shape[-1] > 0, self._size_of(source)
-            nominal = self._nominal(base, sized, size, values) if jitters else None
-            return Start.of(Wanted(source, base, sized, reach, size, names, nominal, share))
-
+        start = partial(self._start, source, values)
         if self._is_real:
             found = start()
         else:
             # all else that new cameras depend on
             sizes = source.image_size, None if like is None else like.image_size
-            key = "start", type(source), *sizes, self._calls.revision, self.ranges.get("fov"), share, *values
+            key = "start", type(source), *sizes, self._calls.revision, self.ranges.get("fov"), self.min_filled, *values
             known = self._memo.entry(tensors, key)
             found = self._memo(tensors, key, start) if known is None else known[2]
         if found is None:
             return None
         return found.warp(values, source if like is None and not self._is_real else found.base, self.options)
 
-    def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
-        values = self._values_for(source, draw)
-        made = self._lazy_warp(source, values, self.min_filled)
-        if made is None:
-            return super()._part(source, draw)
-        if self.min_filled:
-            rows = len(made.filled) // 2
-            factor, found = made.filled[:rows], made.filled[rows:]
-            if min(found, default=1) < self.min_filled or max(factor, default=1) > 1:
-                self._tell_of(source, lambda: made.target, *map(torch.tensor, (factor, found)))
-        simple = made.native is not None and self.options["tolerance"] and not self.options["antialias"]
-        if simple and self.beside_the_camera.isdisjoint(self.ranges):
-            return Part(source, made)
-        return self._part_between(source, made.target, made.rotation, values)
+    def _start(self, source: Camera, values: Mapping[str, Any]) -> Start | None:
+        """Return what native code starts from for values of these names; None if it lacks a range, or a model."""
+        if not self._keeps_formulas:
+            return None
+        names = values.keys() - self.beside_the_camera - {"lens"}
+        base, sized, covered_radius = self._lens_for(source.detach().clone(), values.get("lens"))
+        jitters, size = "distortion" in values and base.distortion.shape[-1] > 0, self._size_of(source)
+        nominal = self._nominal(base, sized, size, values) if jitters else None
+        return Start.of(Wanted(source, base, sized, covered_radius, size, names, nominal, self.min_filled))
 
     def _part_between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
         """Return the part with the effect of the lens on colours and light."""
@@ -265,21 +266,22 @@ class CameraDrawer(Augmentation):
     def _size_of(self, source: Camera) -> tuple[int, int]:
         return self.image_size or source.size_for(self._name)
 
-    def _base(self, source: Camera, share: Any) -> tuple[Camera, Tensor, Tensor | None]:
-        """Return the camera whose lens new cameras have, its intrinsics (*B, 4) for their size, and any reach.
+    def _lens_for(self, source: Camera, share: Any) -> tuple[Camera, Tensor, Tensor | None]:
+        """Return the camera whose lens new cameras have, its intrinsics (*B, 4) for their size, and any covered radius.
 
-        share: of "real" lenses, which one. The reach (*B,) is that of `lenses.drawing.Lenses`.
+        share: of "real" lenses, which one. Only these have the radius (*B,): `reach` of `lenses.drawing.Lenses`.
         """
-        size, like, reach = self._size_of(source), self._like_for(source), None
+        size, like, covered_radius = self._size_of(source), self._like_for(source), None
         base = source if like is None else like
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
         if self._is_real:
-            intrinsics, k, reach = drawn(torch.as_tensor(share, dtype=dtype, device=device), size, self._among)
-            base = remade(_ANY, intrinsics=intrinsics, distortion=k, image_size=size)
+            lens = drawn(torch.as_tensor(share, dtype=dtype, device=device), size, self._among)
+            base = remade(_ANY, intrinsics=lens.intrinsics, distortion=lens.distortion, image_size=size)
+            covered_radius = lens.reach
         if any(t.dtype != dtype or t.device != device for t in base.tensors):
             base = base.each(lambda t: t.to(device, dtype))
         sized = _sized(base, size) if self.fov is None else precise(self._from_source(source, base, size))
-        return base, sized, reach
+        return base, sized, covered_radius
 
     def _nominal(self, base: Camera, sized: Tensor, size: tuple[int, int], values: Mapping[str, Any]) -> Tensor:
         """Return intrinsics (*B, 4) without a graph, with the field of view in the middle of the range."""
