@@ -15,7 +15,7 @@ from typing_extensions import Unpack
 
 from camtorch.augment.cameras import known_camera
 from camtorch.augment.change import Change, Part, by_kinds, check_sizes, one_or_batch
-from camtorch.augment.devices import Elsewhere, remember_camera, twin_of
+from camtorch.augment.devices import Elsewhere, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.matrices import Guess
@@ -198,10 +198,16 @@ class Augmentation(SampleTransform):
 
     def _change_where_drawn(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         """Return the change of a draw, computed where the draw is: on the CPU also for fixed cameras elsewhere."""
-        twin = None if camera.intrinsics.is_cpu or not self.drawn_on_host else twin_of(camera)
-        if twin is None or not all(getattr(value, "is_cpu", True) for value in draw.values()):
+        host = self._on_host(camera)
+        if host is camera or not all(getattr(value, "is_cpu", True) for value in draw.values()):
             return self._change(camera, draw)
-        return Elsewhere(self._change(twin, draw), camera.intrinsics.device)
+        return Elsewhere(self._change(host, draw), camera.intrinsics.device)
+
+    def _on_host(self, camera: Camera) -> Camera:
+        """Return the camera, or its twin on the CPU if new cameras follow from the numbers alone."""
+        if camera.intrinsics.is_cpu or not self.drawn_on_host:
+            return camera
+        return twin_of(camera) or camera
 
     def _state_key(self) -> tuple[Any, ...]:
         """Return what, but for tensors, changes follow from: another key if anything of it or of its parts was set."""
@@ -322,6 +328,7 @@ class Augmentation(SampleTransform):
         """Warn, once, if new images of `camera` will be mostly empty; draws from a generator of its own show it."""
         if self.min_filled is not None or self._calls.warned or self.p == 0:
             return
+        camera = self._on_host(camera)
         camera = camera[0] if camera.is_mixed else camera
         if not are_known(camera.intrinsics):
             return
@@ -407,12 +414,10 @@ class Augmentation(SampleTransform):
             calls = self._calls
             calls.is_first, calls.last = "rotation" not in plan.fields, change
             if count and not calls.warned and "image" in plan.fields.values():
-                self.tell_of_empty_images(change.host.source if isinstance(change, Elsewhere) else camera)
+                self.tell_of_empty_images(camera)
         moved = self._moved(sample, batch, change)
         if self.place or PLACE in sample:
             _put_place(sample, moved, self._name)
-        if isinstance(change, Elsewhere) and isinstance(moved.get("camera"), Camera):
-            remember_camera(moved["camera"], change.host.target if plan.batched else change.host.single)
         return moved, change
 
     @on_samples

@@ -266,29 +266,24 @@ class Change:
     def _counts(self) -> list[int]:
         return [self.count if part.rows is None else len(part.rows) for part in self.parts]
 
-    @property
-    def single(self) -> Camera:
-        """Return the camera after, of a change of one sample; its own, not that of the change."""
-        moves = self.parts[0].moves
-        if isinstance(moves, LazyWarp) and moves.intrinsics.ndim == 1:
-            return moves.new_target()
-        return (self.target[0] if self.gate is not None else one_or_batch(self.parts[0].target)).clone()
+    def camera_for_sample(self, batched: bool) -> Camera:
+        """Return a copy of the cameras after, or of the one of a change of one sample: a sample's, not the change's."""
+        first = self.parts[0]
+        if isinstance(moves := first.moves, LazyWarp):
+            if not batched and moves.intrinsics.ndim == 1:
+                return moves.new_target()
+            if batched and first.rows is None and not self.mixed:
+                return moves.new_target(None if moves.intrinsics.ndim == 2 else self.count)
+        if batched or self.gate is not None:
+            return (self.target if batched else self.target[0]).clone()
+        return one_or_batch(first.target).clone()
 
-    @property
-    def several(self) -> Camera:
-        """Return the cameras after, a batch of all samples; their own, not those of the change."""
-        moves = self.parts[0].moves
-        if isinstance(moves, LazyWarp) and self.parts[0].rows is None and not self.mixed:
-            return moves.new_target(None if moves.intrinsics.ndim == 2 else self.count)
-        return self.target.clone()
-
-    @property
-    def single_rotation(self) -> Tensor:
-        """(3, 3): the rotation of a change of one sample, of its own memory."""
+    def rotation_for_sample(self, batched: bool) -> Tensor:
+        """Return a copy of the rotations (count, 3, 3), or of the one (3, 3) of a change of one sample."""
         moves = self.parts[0].moves
         rotation = None if moves is None else moves.rotation
-        if self.gate is not None or (rotation is not None and rotation.ndim > 2):
-            return self.rotation[0].clone()
+        if batched or self.gate is not None or (rotation is not None and rotation.ndim > 2):
+            return (self.rotation if batched else self.rotation[0]).clone()
         return _eye(self.parts[0].camera.intrinsics) if rotation is None else rotation.clone()
 
     @property

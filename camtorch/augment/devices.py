@@ -74,6 +74,11 @@ class Elsewhere(Change):
             self._wide = Elsewhere(Change(self.host.count, wide, mixed=self.host.mixed), self._device)
         return self._wide.each(value, move, stay)
 
+    def camera_for_sample(self, batched: bool) -> Camera:
+        camera = super().camera_for_sample(batched)
+        remember_camera(camera, self.host.camera_for_sample(batched))
+        return camera
+
     @property
     def mirrored(self) -> Tensor | None:
         mirrored = self.host.mirrored

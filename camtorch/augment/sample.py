@@ -338,12 +338,11 @@ class SampleTransform(KeepsCamera, nn.Module):
             if (seen := self._seen(key, sample.get(key), plan, change)) is not None:
                 moved[key] = seen.contiguous() if batched else seen[0].contiguous()
         if "rotation" not in plan.fields:
-            moved["rotation"] = change.rotation.clone() if batched else change.single_rotation
+            moved["rotation"] = change.rotation_for_sample(batched)
         if mirroring is not None:
             mirroring.exchange(moved, batch.rows(), change.mirrored, batched, self._name)
         if not isinstance(change.parts[0].camera, Unknown):
-            # the change keeps cameras of its own, to go back by
-            target = change.several if batched else change.single
+            target = change.camera_for_sample(batched)
             moved["camera"] = list(target) if isinstance(sample.get("camera"), (list, tuple)) else target
         return moved
 

@@ -87,6 +87,18 @@ def moved_in_place(camera, points):
     return before, camera.project(points), warp.grid(), flipped
 
 
+def shifted_by_a_draw(camera, pixels):
+    """Return pixels moved by a draw on the CPU, of a mount that shifts by depth, for a camera anywhere."""
+    numbers = dict.fromkeys(("yaw", "pitch", "roll", "shift_x", "shift_y", "shift_z"), torch.tensor([0.1]))
+    draw = {
+        **numbers,
+        "zoom": torch.ones(1),
+        "apply": torch.tensor([True]),
+        "of_distance": torch.full((1, 1, *SIZE), 2.0),
+    }
+    return augment.RandomMount(shift=(0.1, 0.1, 0.1)).change(camera.detach(), draw).points(pixels[:1])
+
+
 def counted(make, fields=1, model=ct.Pinhole):
     """Return a case of 8 large images, called a second time."""
 
@@ -149,6 +161,7 @@ CASES |= {
     "augment.FaceNormalizer": augmented(augment.FaceNormalizer, 13, image_size=(16, 16), distance=1, focal=40),
     "augment.RandomMount": augmented(augment.RandomMount, 13, min_filled=0.9),
     "augment.RandomMount shift": augmented(augment.RandomMount, 4, shift=(0.1, 0.1, 0.1)),
+    "augment.RandomMount shift by a draw": tried(shifted_by_a_draw, FISHEYE, PIXELS),
     "augment.RandomLens": augmented(augment.RandomLens, 2, p=0.5, chromatic=0.02, vignetting=(0.2, 0.4)),
     "augment.RandomMount of Mixed": tried(
         lambda i, *each: augment.RandomMount()(augment.HorizontalFlip(p=1)(image=i, camera=ct.Mixed(each))),
