@@ -308,9 +308,9 @@ class CameraDrawer(Augmentation):
         return self._memo(source.tensors + base.tensors, key, narrowed)
 
 
-def _joined(numbers: Sequence[Tensor], like: Tensor) -> Tensor:
+def _joined(numbers: Sequence[Tensor], example: Tensor) -> Tensor:
     """Return (*B, n) of n tensors (*B,), in the dtype of another."""
-    return torch.stack(torch.broadcast_tensors(*numbers), -1).to(like.dtype)
+    return torch.stack(torch.broadcast_tensors(*numbers), -1).to(example.dtype)
 
 
 def _sized(base: Camera, size: tuple[int, int]) -> Tensor:

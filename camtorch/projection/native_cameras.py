@@ -88,12 +88,12 @@ class Lenses:
     def __init__(
         self, plan: ModelPlan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], struct: structs.Cameras
     ):
-        """Take the struct of coefficients (C, n), None in it if not known yet; `domain` is for parts that C lacks."""
+        """Take coefficients (C, n) and their struct, with None for what is not known; `domain` is for what C lacks."""
         self.plan, self.optics_of, self.k, self.python_domain, self.struct = plan, optics_of, k, domain, struct
 
     @classmethod
     def of(cls, plan: ModelPlan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool) -> Lenses:
-        """Return the lenses of coefficients (C, n), with the table for the inverse if `tables` are sure to be used."""
+        """Return the lenses of coefficients (C, n) with their domains, and the table for the inverse if `tables`."""
         struct = structs.Cameras(cameras=len(k), is_double=k.dtype == torch.float64)
         struct.hold(k)
         struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
@@ -243,7 +243,7 @@ class Native:
     """Cameras (C,) of one model in the form of the native geometry."""
 
     def __init__(self, plan: ModelPlan, struct: structs.Cameras, lenses: Callable[[], Lenses]):
-        """Take the cameras' struct, and what returns their lenses; one of both keeps what the struct points to."""
+        """Take the cameras' struct and a function for their lenses, which keep alive what the struct points to."""
         self.plan, self.struct, self.pointer, self._find_lenses = plan, struct, addressof(struct), lenses
         self.cameras, self.dtype = struct.cameras, torch.float64 if struct.is_double else torch.float32
 
