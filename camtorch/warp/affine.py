@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
 from camtorch.warp.grid import coarse
-from camtorch.warp.lattice import Lattice, PixelPositions, straight_lattice
+from camtorch.warp.lattice import PixelPositions, Positions, straight_lattice
 from camtorch.warp.moving import placed
 from camtorch.warp.options import Options, PaddingMode, Sampler
 from camtorch.warp.panorama import lengths
@@ -96,7 +95,8 @@ class MirrorWarp(Warp):
 
     def _depends(self, smooth: bool) -> bool:
         """Whether the ways depend on traced values."""
-        return self._decides and smooth and self.knows_operator
+        mixed = self.source.is_mixed or self.target.is_mixed
+        return self._decides and smooth and self.moves_by_cameras and not mixed
 
     def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[Way] | None:
         """Return the way of each row, or one for all; None to sample as any `Warp` does."""
@@ -215,7 +215,7 @@ class AffineWarp(MirrorWarp):
     def tensors(self) -> list[Tensor]:
         return [self.matrix]
 
-    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> PixelPositions | Lattice:
+    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Positions:
         width = self.image_size[1]
         back = inverted(self.matrix.reshape(-1, 2, 3))
         side = back.new_tensor(self.source.size_for("Warp")[::-1])[:, None]
@@ -289,7 +289,7 @@ def _halved(scale: float) -> int:
     return min(max(math.ceil(math.log2(max(scale / SHRINKS, 0.5))), 0), _MOST)
 
 
-def _halvings(where: PixelPositions | Lattice, source: Camera) -> list[int]:
+def _halvings(where: Positions, source: Camera) -> list[int]:
     """Return for every camera how often to halve its image, measured at the same target pixels on all routes."""
     first, step = coarse(where.size)
     planes = where.every(first, step)
@@ -311,9 +311,9 @@ def _edited(
     images: Tensor, source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, *options: Any
 ) -> tuple[Tensor]:
     """Return the images of an edit, made in the way that its values choose; see `compiled.warped` for the options."""
-    antialias, _, mode, padding_mode, fill, matrix, is_last = options
-    how: Any = {"mode": mode, "padding_mode": padding_mode, "fill": ast.literal_eval(f"({fill},)")}
-    how |= {"antialias": ast.literal_eval(antialias), "tolerance": tolerance}
+    *texts, matrix, is_last = options
+    antialias, _, sampler = compiled.read(*texts)
+    how: Any = {**sampler._asdict(), "antialias": antialias, "tolerance": tolerance}
     warp: Warp = MirrorWarp(source, target, rotation, **how)
     if matrix is not None:
         warp = AffineWarp(source, target, matrix, rotation, **how)

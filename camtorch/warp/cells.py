@@ -27,10 +27,13 @@ Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Pixels (h, w, 2) for every camera, or (B, h, w, 2) for each its own, to positions (B or 1, h, w, 2) as of
 `grid_sample`, `OUTSIDE` where no ray is mapped, and bool (B or 1, h, w): whether one is."""
 
-_MISSED_BY_QUINTICS = 5.5 * 5 / 1024  # of sixth differences: their largest error, also where third derivatives step
-_PROBES = ((4, 0), (0, 4), (8, 4), (4, 8), (4, 4))  # across and down: the middles of a cell's sides, and its own
+_MISSED_BY_QUINTICS = 5.5 * 5 / 1024
+"""How far quintics miss at most, over the nodes' sixth differences: 5 / 1024 if these are even, and 5.5 times as far
+where third derivatives of the positions step."""
+_PROBES = ((4, 0), (0, 4), (8, 4), (4, 8), (4, 4))
+"""Pixels, across and down in a cell, at which polynomials miss most: the middles of its sides, and its own."""
 _MIDDLE = {4: (0.0, -1 / 16, 9 / 16, 9 / 16, -1 / 16, 0.0), 6: tuple(w / 256 for w in (3, -25, 150, 150, -25, 3))}
-"""Weights of six nodes in the middle of a cubic through four of them, and of a quintic."""
+"""Weights of six nodes half-way between the middle two: in a cubic through 4 of them, and in a quintic through 6."""
 
 
 def classify(
@@ -103,9 +106,8 @@ def settle(
 ) -> None:
     """Find out about cells in doubt: polynomials miss most in the middle of a cell and of its sides.
 
-    Where half the tolerance is kept there, or an image that ends in zeros is far off, they become `CELL_CUBIC`; or
-    `CELL_QUINTIC`, for polynomials through six nodes; the others are `CELL_TODO`. The
-    target's first row is `first`.
+    Cells become `CELL_CUBIC` if cubics keep half the tolerance there, or if an image that ends in zeros is far off;
+    else `CELL_QUINTIC` if polynomials through six nodes keep it; else `CELL_TODO`. The target's first row is `first`.
     """
     doubt = cells == CELL_DOUBT
     if not bool(doubt.any()):

@@ -63,12 +63,21 @@ def warped(
 ) -> Tensor:
     """Return warped images (B, C, h, w); an edit passes its `matrix` and, in `by`, its own operator. See `Warp`."""
     turned = None if rotation is None else rotation.detach()
-    # numbers travel as strings: a fill may be an id, which no float holds
-    options = str(antialias), padding, how.mode, how.padding_mode, ",".join(map(repr, how.fill))
+    options = written(antialias, padding, how)
     is_last = str(layout(images) == torch.channels_last)
     given = (*options, matrix, is_last) if by else (*options, is_last)
     (result,) = (by or _warp)(images.detach(), source, target, turned, float(tolerance), *given)
     return result
+
+
+def written(antialias: bool | None, padding: str, how: Sampler) -> tuple[str, str, str, str, str]:
+    """Return options as texts, in which operators and saved programs have them: no float holds a fill that is an id."""
+    return str(antialias), padding, how.mode, how.padding_mode, ",".join(map(repr, how.fill))
+
+
+def read(antialias: str, padding: str, mode: Any, padding_mode: Any, fill: str) -> tuple[bool | None, str, Sampler]:
+    """Return the options of `written` texts."""
+    return ast.literal_eval(antialias), padding, Sampler(mode, padding_mode, ast.literal_eval(f"({fill},)"))
 
 
 def laid(images: Tensor, is_last: str) -> Tensor:
@@ -93,12 +102,10 @@ def _warp(
     images: Tensor, source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, *options: str
 ) -> tuple[Tensor]:
     """Return images (B, C, h, w), plane by plane or with their channels last in memory; see `warped`."""
-    antialias, padding, mode, padding_mode, fill, is_last = options
-
+    *texts, is_last = options
+    antialias, padding, how = read(*texts)
     every = range(target.size_for("Warp")[0])
-    found = partial(locate, source, target, rotation, tolerance, antialias == "True", every, padding)
+    found = partial(locate, source, target, rotation, tolerance, bool(antialias), every, padding)
     inputs = [*source.tensors, *target.tensors, *([] if rotation is None else [rotation])]
     where = _located(inputs, (source.form, target.form, tolerance, antialias, padding, rotation is None), found)
-    how: tuple[Any, Any] = mode, padding_mode
-    values = tuple(ast.literal_eval(f"({fill},)"))
-    return (laid(render(images, where, *how, values), is_last),)
+    return (laid(render(images, where, *how), is_last),)

@@ -33,7 +33,7 @@ from camtorch.projection.native_calls import NativeMove
 from camtorch.values.arguments import columns
 from camtorch.values.threads import on_one_thread
 from camtorch.warp.cells import are_smooth, classify, lay_quintics, places, prefer_quintics, put, settle
-from camtorch.warp.lattice import Lattice, PixelPositions
+from camtorch.warp.lattice import Lattice, PixelPositions, Positions
 from camtorch.warp.panorama import goes_round, lengths, off_poles, seam_of, within_turn
 
 _STRIP = 1 << 19  # pixels
@@ -84,14 +84,14 @@ def locate(
     antialias: bool,
     rows: range,
     padding: str,
-) -> PixelPositions | Lattice:
+) -> Positions:
     """Return where rows of a target sample the source's image: a lattice if that serves, else all positions.
 
     Antialiased images need all, of a lattice or not.
     """
     cameras = Between(source, target, rotation)
 
-    def found(part: range) -> PixelPositions | Lattice:
+    def found(part: range) -> Positions:
         lattice = on_lattice(cameras, part, tolerance, padding) if tolerance else None
         return lattice or PixelPositions(*_row_by_row(cameras, part), None)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -35,9 +35,8 @@ class PixelPositions(NamedTuple):
         """These positions: a `Lattice` has those of all its pixels under this name."""
         return self
 
-    @property
     def like(self) -> Tensor:
-        """A tensor with the dtype, device and graph of the positions, one for each camera."""
+        """Return a tensor with the dtype, device, graph and number of cameras of the positions."""
         return self.grid
 
     @property
@@ -86,9 +85,8 @@ class Lattice:
     size: tuple[int, int]
     scale: ClassVar[None] = None  # images are not antialiased
 
-    @property
     def like(self) -> Tensor:
-        """A tensor with the dtype, device and graph of the positions, one for each camera."""
+        """Return a tensor with the dtype, device, graph and number of cameras of the positions."""
         return self.nodes
 
     def cameras(self, rows: slice | Tensor) -> Lattice:
@@ -127,6 +125,9 @@ class Lattice:
         else:
             grid, seen = _pixel_by_pixel(nodes, cells, *_by_place(cells, exact), self.size)
         return PixelPositions(grid, seen, None)
+
+
+Positions: TypeAlias = PixelPositions | Lattice
 
 
 class _Pixels(Function):

@@ -1,9 +1,11 @@
 """Two cameras at one place, and the way that images and points go from one to the other.
 
-Which way a warp goes is decided in four places. `CameraPair.route` chooses between kept positions, those of a graph,
-strips, and an operator of a compiled graph. `CameraPair.computed` has kept ones found by the same warp on the CPU, by
-an operator, or by `locate` in `grid.py`, which chooses between a lattice and exact positions. `prepared` in
-`sampling.py` chooses between native code and torch.
+Which way a warp goes is decided in four places:
+
+1. `CameraPair.route`: kept positions, those of a graph, strips, or an operator of a compiled graph.
+2. `CameraPair.computed`: positions to keep are found by the same warp on the CPU, by an operator, or by `locate`.
+3. `locate` in `grid.py`: a lattice, or exact positions.
+4. `prepared` in `sampling.py`: native code, or torch.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
 from camtorch.warp import compiled
 from camtorch.warp.grid import local_scale, locate
-from camtorch.warp.lattice import Lattice, PixelPositions
+from camtorch.warp.lattice import PixelPositions, Positions
 from camtorch.warp.moving import moved_pixels
 from camtorch.warp.options import PADDINGS, Mode, Options, PaddingMode, Sampler
 from camtorch.warp.panorama import Seam, seam_of, with_seam
@@ -66,13 +68,13 @@ def _part(held: str, name: str) -> Any:
 class KeptPositions:
     """The positions of a warp's pixels while its cameras stay, or once and for all, and calls that sample there."""
 
-    def __init__(self, pinned: PixelPositions | Lattice | None = None, paddings: Sequence[PaddingMode] = ()):
+    def __init__(self, pinned: Positions | None = None, paddings: Sequence[PaddingMode] = ()):
         """Keep positions by the padding that they serve; `pinned` ones, of these `paddings`, stay if cameras change."""
         self.is_pinned = pinned is not None
         self.calls: dict[tuple[object, ...], Call] = {}
-        self._found: dict[str, PixelPositions | Lattice] = {} if pinned is None else dict.fromkeys(paddings, pinned)
+        self._found: dict[str, Positions] = {} if pinned is None else dict.fromkeys(paddings, pinned)
 
-    def serving(self, padding: str, compute: Callable[[], PixelPositions | Lattice]) -> PixelPositions | Lattice:
+    def serving(self, padding: str, compute: Callable[[], Positions]) -> Positions:
         """Return `compute()` without a graph, or what is kept for a padding."""
         found = self._found.get(padding)
         if found is None:
@@ -82,7 +84,7 @@ class KeptPositions:
                 found = self._found[padding] = compute()
         return found
 
-    def keep(self, call: Call, form: tuple[object, ...], where: PixelPositions | Lattice) -> None:
+    def keep(self, call: Call, form: tuple[object, ...], where: Positions) -> None:
         """Keep the call for images of a form if its positions are kept."""
         if any(where is each for each in self._found.values()):
             if len(self.calls) >= _MOST_CALLS:
@@ -93,7 +95,7 @@ class KeptPositions:
 class CameraPair(GeometryModule):
     """The state of a `Warp`: source, target, rotation and options; and where target pixels lie."""
 
-    moves_by_cameras: ClassVar[bool] = True  # False: by more than cameras and rotation, which one call could take
+    moves_by_cameras: ClassVar[bool] = True  # and a rotation: native code and operators need no more
     keeps_lens: ClassVar[bool] = False  # True: after another warp both are one, `between` the cameras of that
     keeps_depth: ClassVar[bool] = False  # True: depths along the axis stay, as the camera does
     may_mirror: ClassVar[bool] = False  # True: the rotation may be a mirror
@@ -197,7 +199,11 @@ class CameraPair(GeometryModule):
 
     @property
     def _ends(self) -> tuple[Camera, Camera]:
-        """Source and target, by which positions are found."""
+        """Source and target by which positions are found, behind their shutters.
+
+        So there are three sources: `source` is the given one, `_ends[0]` is behind its shutter, and `sampled` is that
+        with images that `seam` lengthens.
+        """
         return self.source, self.target
 
     @property
@@ -207,10 +213,10 @@ class CameraPair(GeometryModule):
 
     @property
     def sampled(self) -> Camera:
-        """The source as the camera of the images that `seam` lengthens."""
+        """The source as the camera of the images that are sampled, see `_ends`."""
         return with_seam(self._ends[0], self.seam)
 
-    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> PixelPositions | Lattice:
+    def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Positions:
         """Return positions of some rows of the target, which serve a padding, within a tolerance."""
         source, target = self._ends
         sampled = with_seam(source, self.seam)
@@ -231,27 +237,26 @@ class CameraPair(GeometryModule):
         * "graph": something learns, so that positions are computed anew with their graph;
         * "kept": positions without a graph, pinned or kept until an input changes.
         """
-        learns = not self.is_pinned and keeps_graph(*self.tensors)
+        is_pinned = self.is_pinned
+        learns = not is_pinned and keeps_graph(*self.tensors)
         if learns and (images is None or images.dtype.is_floating_point):
             return "graph"
         if torch.compiler.is_compiling():  # sizes that a program leaves open would be bounded in it by a comparison
-            return "operator" if images is not None and self.is_called(images) else "kept"
-        if self.is_pinned or math.prod((*self.batch_shape, *self.target.size_for("Warp"))) <= _MOST_KEPT:
+            return "operator" if images is not None and self.goes_by_operator(images) else "kept"
+        if is_pinned or math.prod((*self.batch_shape, *self.target.size_for("Warp"))) <= _MOST_KEPT:
             return "kept"
         looks = all(t.is_cpu and not is_unknown(t) for t in self.tensors)
         return "strips" if looks and (images is None or not in_graph(images)) else "kept"
 
-    def is_called(self, *images: Tensor) -> bool:
-        """Whether a compiled graph calls this warp, or its positions, as an operator: on the CPU, if nothing learns."""
-        if not (is_for_here() and self.knows_operator):
+    def goes_by_operator(self, *images: Tensor) -> bool:
+        """Whether a compiled graph calls this warp, or its positions, as an operator, which is traced no further.
+
+        It does for cameras of one model each, on the CPU, if nothing learns.
+        """
+        if not (is_for_here() and self.moves_by_cameras) or self.source.is_mixed or self.target.is_mixed:
             return False
         inputs = *images, *self.tensors
         return all(t.is_cpu for t in inputs) and not keeps_graph(*inputs)
-
-    @property
-    def knows_operator(self) -> bool:
-        """Whether there is an operator for a warp of this kind, whose cameras are of one model each."""
-        return self.moves_by_cameras and not (self.source.is_mixed or self.target.is_mixed)
 
     def ready(self, images: object, mode: str | None, padding: str | None) -> Call | None:
         """Return the call that an earlier one has left for images of this form, if nothing has changed since."""
@@ -276,7 +281,7 @@ class CameraPair(GeometryModule):
         route, given = route or self.route(images), images
         images = self.lengthened(images)
         if route == "operator":
-            options = self.tolerance, self.antialias, self._reach(sampler.padding_mode), sampler
+            options = self.tolerance, self.antialias, self._padding_served(sampler.padding_mode), sampler
             return compiled.warped(images, self.sampled, self.target, self.rotation, *options)
         if route == "strips":
             cameras = math.prod(self.batch_shape)
@@ -292,7 +297,7 @@ class CameraPair(GeometryModule):
         if call is None:
             return by_torch(images, where, sampler)
         result = call(images)
-        # most warps are used once, and keep no calls
+        # from the second call on, as most warps have one: `known` was read before `positions` made the entry
         if known is not None and images is given and sampler.fill == self.fill:
             known.keep(call, self._form_of(images, sampler.mode, sampler.padding_mode), where)
         return result
@@ -302,9 +307,9 @@ class CameraPair(GeometryModule):
         seam = self.seam
         return images if seam is None else laid_as(images, seam.around(images))
 
-    def positions(self, route: Route, padding: PaddingMode = "zeros") -> PixelPositions | Lattice:
+    def positions(self, route: Route, padding: PaddingMode = "zeros") -> Positions:
         """Return the positions at which target pixels sample the source's image: kept ones unless they have a graph."""
-        is_traced, reach, tolerance = in_jit_trace(), self._reach(padding), self.tolerance
+        is_traced, served, tolerance = in_jit_trace(), self._padding_served(padding), self.tolerance
         if route == "graph":
             if is_traced:
                 raise RuntimeError(
@@ -312,12 +317,13 @@ class CameraPair(GeometryModule):
                     "that do. Use torch.onnx.export(dynamo=True) or torch.export; or make the map a constant by "
                     "warp.requires_grad_(False)"
                 )
-            return self.locate(range(self.target.size_for("Warp")[0]), reach, tolerance)
+            return self.locate(range(self.target.size_for("Warp")[0]), served, tolerance)
         if records_constants() and (constant := self._constant(padding)):
             return constant
         with set_aside() if is_traced else nullcontext():
-            compute = partial(self.computed, reach, tolerance)
-            where = self._positions().serving(reach if tolerance else "zeros", compute)
+            # exact positions serve every padding, so one entry is enough
+            served = served if tolerance else "zeros"
+            where = self._positions().serving(served, partial(self.computed, served, tolerance))
             return where.pixels if is_traced else where  # constants of the trace
 
     def _positions(self) -> KeptPositions:
@@ -328,12 +334,12 @@ class CameraPair(GeometryModule):
         """Return the positions of all pixels, one by one."""
         return self.positions(self.route()).pixels
 
-    def computed(self, padding: PaddingMode, tolerance: float) -> PixelPositions | Lattice:
+    def computed(self, padding: PaddingMode, tolerance: float) -> Positions:
         """Return the positions of all pixels, without a graph, which serve a padding."""
         if tolerance:
             if not self.antialias and (host := self.host) is not None:
                 return host.positions("kept", padding).on(self.target.intrinsics.device)
-            if self.is_called():
+            if self.goes_by_operator():
                 planes, mapped = compiled.positions(self.sampled, self.target, self.rotation, tolerance, padding)
                 grid = planes.movedim(1, -1)
                 return PixelPositions(grid, mapped, local_scale(grid, mapped, self.sampled) if self.antialias else None)
@@ -346,7 +352,7 @@ class CameraPair(GeometryModule):
         for top in range(0, height, step):
             rows = range(top, min(top + step, height))
             with torch.no_grad():
-                where = self.locate(rows, self._reach(padding), self.tolerance)
+                where = self.locate(rows, self._padding_served(padding), self.tolerance)
             yield slice(rows.start, rows.stop), where
 
     def in_strips(self, images: Tensor, count: int | None, sampler: Sampler) -> Iterator[tuple[slice, Tensor, Tensor]]:
@@ -358,18 +364,18 @@ class CameraPair(GeometryModule):
                 part, valid = render(images, where, *sampler, kept), self.on_image(where)
             yield rows, part, valid
 
-    def on_image(self, where: PixelPositions | Lattice) -> Tensor:
+    def on_image(self, where: Positions) -> Tensor:
         """Whether the source maps pixels onto its image, (B or 1, 1, h, W')."""
         grid, source = where.pixels.grid.detach(), self.sampled
         pixels = (grid + 1) * grid.new_tensor(source.size_for("Warp")[::-1]) / 2 - 0.5
         return (where.pixels.mapped & source.contains(pixels)).unsqueeze(1)
 
-    def _reach(self, padding: PaddingMode) -> PaddingMode:
+    def _padding_served(self, padding: PaddingMode) -> PaddingMode:
         """Return the padding of positions that serve the warp's own padding and this one."""
         # torch.compile knows no max with a key
         return PADDINGS[max(PADDINGS.index(self.padding_mode), PADDINGS.index(padding))]
 
-    def _constant(self, padding: PaddingMode) -> PixelPositions | Lattice | None:
+    def _constant(self, padding: PaddingMode) -> Positions | None:
         """Return the positions as a constant of an exported program; None if they depend on its inputs."""
         if not self.is_pinned and not is_constant(self):
             return None
@@ -381,4 +387,4 @@ class CameraPair(GeometryModule):
                 return where._replace(grid=grid, mapped=mapped)
 
             known = self._positions()
-            return own() if known.is_pinned else known.serving(f"constant {self._reach(padding)}", own)
+            return own() if known.is_pinned else known.serving(f"constant {self._padding_served(padding)}", own)

@@ -31,14 +31,14 @@ Label = Literal["pixels", "boxes", "rays", "columns", "pose", "rotation vectors"
 of which those of a pose begin with a rotation; or rotation vectors."""
 MovedField = tuple[Tensor, Tensor | None]
 """A value after a move, and which of it is valid, if it has validity."""
-Placed = Callable[[Tensor, int], MovedField]
+Reader = Callable[[Tensor, int], MovedField]
 """Has C read a value, and returns its results; the number is the step from one camera's turn to the next one's."""
 Sizes = tuple[tuple[int, int], tuple[int, int]]  # (height, width) of the source's image, and of the target's
 
 _FORMS = {"pose": structs.POSE, "rotation vectors": structs.ROTATION_VECTORS}  # others are rays
 _FEW = 2  # tiles: an image of no more is made by one thread
 _EVEN = 4  # samples a thread: with as many, threads that idle at the end matter little
-_PIXELS = 1 << structs.LEFT_BITS  # C multiplies flags about pixels by this, to tell them from those about the lattice
+_FLAGS_OF_PIXELS = 1 << structs.LEFT_BITS  # flags of pixels stand above those of the lattice
 
 
 def natives_of(warp: CameraPair) -> tuple[Native, Native, Tensor | None] | None:
@@ -172,69 +172,64 @@ class SampleCall:
             nodes = probes(0, sizes[1], dtype)
             self._lattices = Lattices(nodes, sizes[1], sizes[0], tolerance, padding, count)
         images, moving = len(samplers), sum(how in ("pixels", "boxes") for how in hows)
-        self._jobs, pixels = (structs.Job * images)(), (structs.Move * moving)()
-        vectors = (structs.Turned * (len(hows) - images - moving))()
-        call = self._call = structs.Together(job_count=images, move_count=moving, turned_count=len(vectors))
-        call.jobs, call.moves, call.turned = (call.keep(array) for array in (self._jobs, pixels, vectors))
+        self._jobs, moves = (structs.Job * images)(), (structs.Move * moving)()
+        turns = (structs.Turned * (len(hows) - images - moving))()
+        call = self._call = structs.Together(job_count=images, move_count=moving, turned_count=len(turns))
+        call.jobs, call.moves, call.turned = (call.keep(array) for array in (self._jobs, moves, turns))
         call.lattices = self._lattices.struct
         self._back = call.lattices.move  # from the target to the source, which images are sampled by
         if count > 1:  # C samples images as soon as their lattice is made
             call.lattices.jobs, call.lattices.job_count = call.jobs, call.job_count
         else:
             self._back.next = None  # one thread makes the lattice, and needs no counter of those made
-        self._tiles = 1
-        jobs, moves, turns = iter(self._jobs), iter(pixels), iter(vectors)
-        self._places = [  # of each value: has C read it, and returns its results
-            self._image(next(jobs), value, how)
-            if isinstance(how, Sampler)
-            else self._pixels(next(moves), value, 2 if how == "pixels" else 4)
-            if how in ("pixels", "boxes")
-            else self._vectors(next(turns), value, how)
-            for value, how in zip(values, hows, strict=True)
-        ]
-        self._left = images if count == 1 else 0  # images that the lattices' call has not made
-        self._is_whole = self._tiles <= _FEW or not self._left  # whether one thread makes all
+        self._most_tiles = 1  # of the images, each of which threads share
+        self._readers: list[Reader] = []  # of each value
+        free_jobs, free_moves, free_turns = iter(self._jobs), iter(moves), iter(turns)
+        for value, how in zip(values, hows, strict=True):
+            if isinstance(how, Sampler):
+                reader = self._reader_of_images(next(free_jobs), value, how)
+            elif how in ("pixels", "boxes"):
+                reader = self._reader_of_pixels(next(free_moves), value, 2 if how == "pixels" else 4)
+            else:
+                reader = self._reader_of_vectors(next(free_turns), value, how)
+            self._readers.append(reader)
+        self._images_of_call = images if count == 1 else 0  # those of a batch are made with their lattices
+        self._one_thread = self._most_tiles <= _FEW or not self._images_of_call  # whether it makes all
         self._copied = [  # which values C reads from copies
             i
             for i, (value, how) in enumerate(zip(values, hows, strict=True))
             if how in ("pixels", "boxes") and not (value.dtype == dtype and value.is_contiguous())
         ]
-        self._doubtful = [i for i, how in enumerate(hows) if how in ("boxes", "pose", "rotation vectors")]
+        self._may_be_refused = [i for i, how in enumerate(hows) if how in ("boxes", "pose", "rotation vectors")]
         self._decides = decides and any(
             isinstance(how, Sampler) and how.mode != "nearest" and value.dtype != torch.bool
             for value, how in zip(values, hows, strict=True)
         )
 
-    def _image(self, job: structs.Job, like: Tensor, how: Sampler) -> Placed:
+    def _reader_of_images(self, job: structs.Job, like: Tensor, how: Sampler) -> Reader:
         image = _as_images(like, self._batched)
         make = maker(image, self._count, self._sizes[1])
         result, make = make(), _image_maker(like, self._batched, make)
-        describe(
-            job,
-            image,
-            result,
-            how.mode,
-            how.padding_mode,
-            how.fill * image.shape[1] if len(how.fill) == 1 else how.fill,
-        )
+        fill = how.fill * image.shape[1] if len(how.fill) == 1 else how.fill
+        describe(job, image, result, how.mode, how.padding_mode, fill)
         self._lattices.lay(job)
-        self._tiles = max(self._tiles, tiles_of(result[:1]))
+        self._most_tiles = max(self._most_tiles, tiles_of(result[:1]))
 
-        def placed(value: Tensor, step: int) -> MovedField:
+        def read(value: Tensor, step: int) -> MovedField:
             result = make()
             job.source, job.result = value.data_ptr(), result.data_ptr()
             return result, None
 
-        return placed
+        return read
 
-    def _pixels(self, move: structs.Move, like: Tensor, each: int) -> Placed:
+    def _reader_of_pixels(self, move: structs.Move, like: Tensor, each: int) -> Reader:
         dtype, back, many = self._dtype, self._back, like.numel() // (each * self._count) if self._count else 0
         move.turn_strides[:], move.cameras, (move.height, move.width) = (0, 3, 1), self._count, self._sizes[1]
         move.form = structs.ON_IMAGE if each == 2 else structs.BOXES
         move.count, move.tile = many, max(many, 1)
         move.row_strides[:] = move.result_strides[:] = each * many, each, 1
 
-        def placed(rows: Tensor, step: int) -> MovedField:
+        def read(rows: Tensor, step: int) -> MovedField:
             result = torch.empty(rows.shape, dtype=dtype, device="cpu")
             valid = torch.empty(rows.shape[:-1], dtype=torch.bool, device="cpu")
             move.from_, move.to, move.turns = back.to, back.from_, back.turns
@@ -242,19 +237,19 @@ class SampleCall:
             move.rows, move.results, move.valid = rows.data_ptr(), result.data_ptr(), valid.data_ptr()
             return result, valid
 
-        return placed
+        return read
 
-    def _vectors(self, turned: structs.Turned, like: Tensor, how: Label) -> Placed:
+    def _reader_of_vectors(self, turned: structs.Turned, like: Tensor, how: Label) -> Reader:
         width, is_matrix, back = like.shape[-1], how in ("columns", "pose"), self._back
         turned.strides[:], turned.count = ((1, width), width) if is_matrix else ((3, 1), like.numel() // 3)
         turned.is_double, turned.form = self._dtype == torch.float64, _FORMS.get(how, structs.RAYS)
 
-        def placed(value: Tensor, step: int) -> MovedField:
+        def read(value: Tensor, step: int) -> MovedField:
             result = value.clone()
             turned.turn, turned.rows, turned.results = back.turns, value.data_ptr(), result.data_ptr()
             return result, None
 
-        return placed
+        return read
 
     def __call__(
         self, source: Native, target: Native, rotation: Tensor | None, values: Sequence[Tensor]
@@ -273,7 +268,8 @@ class SampleCall:
             turns = None if rotation is None else rotation.mT
             if not _surely_keeps_size(NativeMove(target, source, turns, self._sizes[0], False), self._sizes):
                 return None
-        call, back = self._call, self._back
+        # what a draw changes: cameras and rotation, and where values and results lie
+        call, back, native, threads = self._call, self._back, loaded(), thread_count()
         target.add_table()
         if call.move_count:
             source.add_table()
@@ -281,36 +277,37 @@ class SampleCall:
         if self._copied:
             values = [value.to(dtype).contiguous() if i in self._copied else value for i, value in enumerate(values)]
         results: list[MovedField | None] = [
-            placed(value, step) for placed, value in zip(self._places, values, strict=True)
+            read(value, step) for read, value in zip(self._readers, values, strict=True)
         ]
-        native, threads = loaded(), thread_count()
+        # images of a batch, by the threads that make the lattices
         if self._count > 1 and len(self._jobs):
             run, counters = native.camtorch_lattices, self._lattices.counters
             if run_and_follow(run, call.lattices, self._count, counters, target, source):
                 return None
-        is_whole = self._is_whole or threads == 1
-        call.job_count, call.is_whole = self._left, is_whole
+        # all else: if one thread makes it, with the image; else its lattice, by which threads then share each image
+        one_thread = self._one_thread or threads == 1
+        call.job_count, call.is_whole = self._images_of_call, one_thread
         while flags := native.camtorch_together(call):
             if flags & structs.LEFT_MOST:
                 return None
             if self._follow(flags, source, target) == structs.LEFT_LABELS:
-                for i in self._doubtful:
+                for i in self._may_be_refused:
                     results[i] = None
                 break
-        if not is_whole:
+        if not one_thread:
             for job in self._jobs:
                 job.next = 0
-                spread(functools.partial(native.camtorch_sample, job), min(threads, self._tiles))
+                spread(functools.partial(native.camtorch_sample, job), min(threads, self._most_tiles))
         return results
 
     def _follow(self, flags: int, source: Native, target: Native) -> int:
         """Compute limits that the call lacked: of cameras for the lattice, or for pixels, whose flags it returns."""
-        left, (start, end) = (flags, (target, source)) if flags < _PIXELS else (flags // _PIXELS, (source, target))
+        of_pixels = flags // _FLAGS_OF_PIXELS
+        left, (start, end) = (of_pixels, (source, target)) if of_pixels else (flags, (target, source))
         if left & structs.LEFT_FROM:
             start.follow()
         if left & structs.LEFT_TO:
             end.follow()
-        if flags < _PIXELS:
-            return 0
-        self._call.job_count = 0  # the images are made
-        return left
+        if of_pixels:
+            self._call.job_count = 0  # the images are made
+        return of_pixels

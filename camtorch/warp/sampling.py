@@ -16,7 +16,7 @@ from camtorch.native import memory, sampler
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, wide_dtype, widen
 from camtorch.values.threads import thread_count
 from camtorch.warp.grid_sample import is_sampled_natively, padded, sample
-from camtorch.warp.lattice import Lattice, PixelPositions
+from camtorch.warp.lattice import PixelPositions, Positions
 from camtorch.warp.options import Mode, PaddingMode, Sampler
 
 SHRINKS = 1.5  # pixels of the image to one of the result, from which on edits antialias by themselves
@@ -29,7 +29,7 @@ _TRACED_LEVELS = 4  # if the values that decide cannot be read: down to a sixtee
 
 def render(
     images: Tensor,
-    where: PixelPositions | Lattice,
+    where: Positions,
     mode: Mode,
     padding_mode: PaddingMode,
     fill: tuple[float, ...],
@@ -54,25 +54,23 @@ def laid_as(images: Tensor, result: Tensor) -> Tensor:
     return result.contiguous(memory_format=torch.channels_last)
 
 
-def prepared(
-    images: Tensor, where: PixelPositions | Lattice, how: Sampler, out: Tensor | None = None
-) -> sampler.Call | None:
+def prepared(images: Tensor, where: Positions, how: Sampler, out: Tensor | None = None) -> sampler.Call | None:
     """Return the call of native code for images (B or 1, C, H, W) of this form, of which results lie like `out`.
 
     None with a graph, a transform, another device or dtype, or antialiasing.
     """
     mode, padding_mode, fill = how
-    if not is_sampled_natively(images, where.like, mode) or (where.scale is not None and mode != "nearest"):
+    like = where.like()
+    if not is_sampled_natively(images, like, mode) or (where.scale is not None and mode != "nearest"):
         return None
     fill = fill * images.shape[1] if len(fill) == 1 else fill
-    cameras = where.like.shape[0]
-    images = images if cameras == 1 else images.expand(cameras, -1, -1, -1)
+    images = images if len(like) == 1 else images.expand(len(like), -1, -1, -1)
     return sampler.Call(images, where.size, mode, padding_mode, fill, **where.for_native(padding_mode), out=out)
 
 
 def by_torch(
     images: Tensor,
-    where: PixelPositions | Lattice,
+    where: Positions,
     how: Sampler,
     kept: dict[int, Pyramid] | None = None,
     out: Tensor | None = None,

@@ -230,7 +230,7 @@ class Warp(CameraPair):
     def pin(self) -> Warp:
         """Compute the grid once, with its graph, for a warp whose cameras will not change; return the warp."""
         # the operator of a compiled graph keeps its own; what inference mode makes could not be used in a graph later
-        if self.is_pinned or self.is_called() or torch.is_inference_mode_enabled():
+        if self.is_pinned or self.goes_by_operator() or torch.is_inference_mode_enabled():
             return self
         learns = self.route() == "graph"
         every = range(self.target.size_for("Warp")[0])
