@@ -59,9 +59,8 @@ def test_rows_of_other_cameras_and_shapes_are_errors_before_a_call():
 
 @has_library
 def test_each_call_has_a_known_answer():
-    asked = [name for name, *_ in self_test._answers(library())]
     calls = headers.read().calls.items()
-    assert sorted(asked) == sorted(name for name, (_, given) in calls if given not in ([], ["char*"]))
+    assert sorted(self_test.ANSWERS) == sorted(name for name, (_, given) in calls if given not in ([], ["char*"]))
 
 
 FIELD = "    int64_t next; /* the next tile that a free thread takes */\n"
