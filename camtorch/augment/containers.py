@@ -52,10 +52,10 @@ def with_boxes(params: Any, boxes: Tensor) -> Any:
     given = as_values(boxes, "boxes", "with_boxes")
     check_boxes(given, "boxes", "with_boxes")
     result, found = _edited(params, "box", "with_boxes: params must be those of a BoxCrop")
-    for own, name in found:
-        if tuple(given.shape) != (len(own[name]), 4):
-            raise ValueError(f"with_boxes: boxes must be ({len(own[name])}, 4); got {tuple(given.shape)}")
-        own[name] = given
+    for part, name in found:
+        if tuple(given.shape) != (len(part[name]), 4):
+            raise ValueError(f"with_boxes: boxes must be ({len(part[name])}, 4); got {tuple(given.shape)}")
+        part[name] = given
     return result
 
 
@@ -79,16 +79,16 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
             f"with_cameras: cameras must be a batch, or a list, of one model and size; got {type(cameras).__name__}"
         )
     result, found = _edited(params, KIND, "with_cameras: params must be those of a camera augmentation")
-    for own, name in found:
-        kinds, kind, batch = own[name], kind_of_camera(cameras), tuple(cameras.batch_shape)
+    for part, name in found:
+        kinds, kind, batch = part[name], kind_of_camera(cameras), tuple(cameras.batch_shape)
         if len(kinds) and kinds[0].tolist() != kind:
             raise ValueError(f"with_cameras: cameras must be of the params' model and image_size; got {cameras!r:.200}")
-        count, clips = len(kinds), int(own.get("video_batch_size", len(kinds)))
+        count, clips = len(kinds), int(part.get("video_batch_size", len(kinds)))
         if batch not in ((), (1,), (count,), (clips,)):
             raise ValueError(f"with_cameras: cameras must be {count}, one for each sample; got batch dims {batch}")
         frames = count // clips if batch == (clips,) and clips else 1
         for key, numbers in zip(_NUMBERS, (cameras.intrinsics, cameras.distortion), strict=True):
-            own[key] = numbers.expand(*(batch or (1,)), -1).repeat_interleave(frames, 0).expand(count, -1)
+            part[key] = numbers.expand(*(batch or (1,)), -1).repeat_interleave(frames, 0).expand(count, -1)
     return result
 
 
@@ -110,13 +110,13 @@ def _parts(params: Any, module: nn.Module | None = None) -> Iterator[tuple[Any, 
             yield from _parts(item.data, None if module is None else module.get_submodule(item.name))
 
 
-def camera_with_params(params: Params, own: Camera, device: torch.device | None) -> Camera:
-    """Return the camera with the numbers that the params carry, by default those of `own`."""
-    given = own.intrinsics, own.distortion
-    device = own.intrinsics.device if device is None else device
-    intrinsics, distortion = (params.get(n, value).to(device) for n, value in zip(_NUMBERS, given, strict=True))
-    same = intrinsics is given[0] and distortion is given[1]
-    return own if same else remade(own, intrinsics=intrinsics, distortion=distortion)
+def camera_with_params(params: Params, camera: Camera, device: torch.device | None) -> Camera:
+    """Return the camera with the numbers that the params carry, by default those that it has."""
+    numbers = camera.intrinsics, camera.distortion
+    device = camera.intrinsics.device if device is None else device
+    intrinsics, distortion = (params.get(n, value).to(device) for n, value in zip(_NUMBERS, numbers, strict=True))
+    same = intrinsics is numbers[0] and distortion is numbers[1]
+    return camera if same else remade(camera, intrinsics=intrinsics, distortion=distortion)
 
 
 _CODES: dict[str, int] = {}  # of names of models; compilers, which do not know zlib, look them up
@@ -145,10 +145,10 @@ def _read_dict(container: Any, given: Sample, ours: list[FrontEnd]) -> _Dict:
     owner, texts = type(container).__name__, {name: value for name, value in given.items() if is_text(value)}
     rest = {name: value for name, value in given.items() if name not in texts}
     keys = {name: container._read_datakeys_from_dict((name,))[0] for name in rest}
-    unknown = [n for n, own in keys.items() if n not in OWN and own in ([], [DataKey.CLASS], [DataKey.LABEL])]
+    unknown = [n for n, key in keys.items() if n not in OWN and key in ([], [DataKey.CLASS], [DataKey.LABEL])]
     if flags := [name for name in rest if name.endswith("_valid") and name not in unknown]:
         raise ValueError(f"{owner}: a flag must be no kornia key; got {flags[0]}. Use its own keypoints_valid")
-    image = next((rest[name] for name, own in keys.items() if own == [DataKey.INPUT]), None)
+    image = next((rest[name] for name, key in keys.items() if key == [DataKey.INPUT]), None)
     is_single = image is not None and image.ndim < 4
     named = {name: kind for one in ours for name, kind in one.augmentation.fields.items()}
     filled = {name: rest[name] for name in unknown if rest[name] is not None}
@@ -221,10 +221,10 @@ def _with_fields(
         params = _params_for(self, camera, read.image, params)
     result, fields = call(self, read.rest, params=params), read.fields
     applied = [pair for pair in _parts(self._params if params is None else params, self) if pair[0] in ours]
-    for part, own in reversed(applied) if back else applied:
-        fields = _moved(part, fields, own, read.kinds, back) if read.kinds else fields
+    for part, drawn in reversed(applied) if back else applied:
+        fields = _moved(part, fields, drawn, read.kinds, back) if read.kinds else fields
         if read.camera is not None:
-            change: Change = part.change(own)
+            change: Change = part.change(drawn)
             cameras = change.source if back else change.target
             cameras = (cameras[0] if isinstance(read.fields, Single) else cameras).clone()
             result["camera"] = list(cameras) if isinstance(read.camera, list) else cameras
@@ -243,15 +243,15 @@ def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: Data
     return result
 
 
-def _put(of: type[nn.Module], name: str, own: Callable[..., Any]) -> None:
-    """Replace method `name` of the class `of` by `own(old, container, *args)`, for containers of our augmentations."""
+def _put(of: type[nn.Module], name: str, by: Callable[..., Any]) -> None:
+    """Replace method `name` of the class `of` by `by(old, container, *args)`, for containers of our augmentations."""
     call = getattr(of, name)
     call = getattr(call, "__wrapped__", call)  # this module may be imported again
 
     @functools.wraps(call)
     def method(self: Any, *args: Any, **kwargs: Any) -> Any:
         ours = any(isinstance(one, FrontEnd) for one in self.modules())
-        return own(call, self, *args, **kwargs) if ours else call(self, *args, **kwargs)
+        return by(call, self, *args, **kwargs) if ours else call(self, *args, **kwargs)
 
     setattr(of, name, method)
 

@@ -154,11 +154,11 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
                 f"{type(self).__name__}: params must hold boxes, as kornia passes boxes after images; got none. Use "
                 "params = aug.forward_parameters(images.shape), then aug(images, params=with_boxes(params, boxes))"
             )
-        own = self.camera
-        if isinstance(own, Guess):
+        camera = self.camera
+        if isinstance(camera, Guess):
             size = (params[KIND][0] if len(params[KIND]) else params["forward_input_shape"])[-2:]
-            own = self.camera_for(size.tolist())
-        camera = camera_with_params(params, own, device)
+            camera = self.camera_for(size.tolist())
+        camera = camera_with_params(params, camera, device)
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
         inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
         key = type(camera), camera.image_size, self.augmentation._state_key()
@@ -207,8 +207,8 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
 
     def apply_transform_keypoint(self, input: Keypoints, params: Params, flags: Flags, transform: Any = None) -> Any:
         def move(change: Change, pixels: Tensor) -> tuple[Tensor, Tensor]:
-            given = torch.where((pixels == -1).all(-1, keepdim=True), torch.nan, pixels)
-            moved = self.augmentation.moved_by(change, {"keypoints": given}, predicted=True)
+            placed = torch.where((pixels == -1).all(-1, keepdim=True), torch.nan, pixels)
+            moved = self.augmentation.moved_by(change, {"keypoints": placed}, predicted=True)
             return torch.where(moved["keypoints"].isnan(), -1.0, moved["keypoints"]), moved["keypoints_valid"]
 
         result, self.keypoints_valid = self._move_rows(input, 3, params, flags, move)
@@ -276,15 +276,15 @@ class _Random(CameraAugmentation):
 
     def __init__(self, *given: Any, camera: Camera | float | None = None, **options: Any):
         name = type(self).__name__
-        first, own = (given[0], given[1:]) if camera is None and given else (camera, given)
+        first, others = (given[0], given[1:]) if camera is None and given else (camera, given)
         guess = first is camera and isinstance(first, (int, float)) and not isinstance(first, bool)
         if not isinstance(first, Camera) and not guess:
             preset, got = (f", {first!r}", repr(first)) if isinstance(first, str) else ("", type(first).__name__)
             raise TypeError(
                 f"{name}: camera must be the Camera of the images and comes first: {name}(camera{preset}); got {got}"
             )
-        theirs = {key: options.pop(key) for key in ("p", "p_batch", "same_on_batch", "keepdim") if key in options}
-        super().__init__(self._wraps(*own, **options), first, **theirs)
+        of_kornia = {key: options.pop(key) for key in ("p", "p_batch", "same_on_batch", "keepdim") if key in options}
+        super().__init__(self._wraps(*others, **options), first, **of_kornia)
 
 
 def _named(wraps: type[Augmentation]) -> type[_Random]:

@@ -84,19 +84,19 @@ def matrix_hint(name: str, value: Tensor, batched: bool) -> str:
 
 def check_matrix(value: Tensor, name: str, owner: str) -> None:
     """Raise a ValueError if matrices (..., 3, 3) or (..., 4, 4) are not those of pinhole cameras without skew."""
-    given = value.detach()
-    wanted = torch.eye(given.shape[-1], dtype=given.dtype, device=given.device)
-    wanted[:2, :3] = given.new_tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
+    matrix = value.detach()
+    wanted = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    wanted[:2, :3] = matrix.new_tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
     free = torch.zeros_like(wanted, dtype=torch.bool)
     free[0, 0] = free[1, 1] = free[0, 2] = free[1, 2] = True
     free[3:, 3:] = True
-    as_wanted = given == wanted
+    as_wanted = matrix == wanted
     for row, column in ((0, 1), (1, 0)):  # which rounding may leave of a product of matrices
-        as_wanted[..., row, column] |= given[..., row, column].abs() <= _SKEW * given[..., 0, 0]
-    wrong = ~(torch.where(free, torch.isfinite(given), as_wanted).flatten(-2).all(-1))
-    wrong = wrong | (given[..., 0, 0] <= 0) | (given[..., 1, 1] <= 0)
+        as_wanted[..., row, column] |= matrix[..., row, column].abs() <= _SKEW * matrix[..., 0, 0]
+    wrong = ~(torch.where(free, torch.isfinite(matrix), as_wanted).flatten(-2).all(-1))
+    wrong = wrong | (matrix[..., 0, 0] <= 0) | (matrix[..., 1, 1] <= 0)
     if known_false(~wrong):
-        one = given.reshape(-1, *given.shape[-2:])[wrong.reshape(-1)][0].tolist()
+        one = matrix.reshape(-1, *matrix.shape[-2:])[wrong.reshape(-1)][0].tolist()
         raise ValueError(
             f"{owner}: {name} must be {SHAPE}, with fx, fy above 0 and no skew; got {one}. Leave one unchanged with "
             f"fields={{{name!r}: 'keep'}}, and give the camera of the images as camera="

@@ -81,9 +81,9 @@ class Transform(FrontEnd):
         **fields: Any,
     ) -> Sample:
         """Augment a sample: keyword arguments, a dict, or both; see `Augmentation.forward` for the other arguments."""
-        given, write = self._read(sample, fields, self.camera)
+        tensors, write = self._read(sample, fields, self.camera)
         with torch.no_grad():
-            return write(self.augmentation.forward(given, **_set(draw=draw, generator=generator)))
+            return write(self.augmentation.forward(tensors, **_set(draw=draw, generator=generator)))
 
     def inverse(
         self,
@@ -98,8 +98,8 @@ class Transform(FrontEnd):
         if draw is None and camera is not None:
             fields["camera"] = camera
         with torch.no_grad():  # as the camera before may learn
-            given, write = self._read(sample, fields)
-            return write(self.augmentation.inverse(given, **options))
+            tensors, write = self._read(sample, fields)
+            return write(self.augmentation.inverse(tensors, **options))
 
     def __repr__(self) -> str:
         return f"Transform({self.augmentation!r})"
@@ -123,24 +123,24 @@ class Transform(FrontEnd):
         else:
             settings = {**self.augmentation.fields}, self.augmentation.mirroring
             ways = self._forms((), (form, size, *settings), lambda: self._ways(sample, size))
-        tensors = {name: way.read(sample[name]) for name, way in ways.items()}
-        given = Single()
-        for of_field in tensors.values():
-            given.update(of_field)
+        read = {name: way.read(sample[name]) for name, way in ways.items()}
+        tensors = Single()
+        for of_field in read.values():
+            tensors.update(of_field)
 
         def written(moved: Sample) -> Sample:
             result = {
                 name: way.write(moved, sample[name])
                 for name, way in ways.items()
-                if tensors[name].keys() <= moved.keys()  # a face is moved back without its rotation
+                if read[name].keys() <= moved.keys()  # a face is moved back without its rotation
             }
             for name, value in moved.items():
-                if name not in given or name == PLACE:
+                if name not in tensors or name == PLACE:
                     value = plain(value) if isinstance(value, Tensor) else value
                     result[name] = value[0] if name.endswith(_VALID) and value.ndim == 3 else value
             return result
 
-        return given, written
+        return tensors, written
 
     def _kind(self, name: str, value: Any, sample: Mapping[str, Any]) -> str | None:
         """Return the kind of a field, or of the field whose validity it is; None if it is not moved."""

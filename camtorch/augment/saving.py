@@ -76,8 +76,8 @@ def from_plain(value: Any, owner: str) -> Any:
 def _augmentations(kind: type[Augmentation]) -> Iterator[type[Augmentation]]:
     """Yield a class and those that are made of it."""
     yield kind
-    for own in kind.__subclasses__():
-        yield from _augmentations(own)
+    for subclass in kind.__subclasses__():
+        yield from _augmentations(subclass)
 
 
 def _name_of(kind: type) -> str:

@@ -223,29 +223,29 @@ def _read_leaf(name: str, leaf: Any, kind: str | None) -> _Leaf:
     return _Leaf(kind, pixels, write_on_canvas)
 
 
-def _read_points(given: Tensor, centre: float = 0.0) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+def _read_points(numbers: Tensor, centre: float = 0.0) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
     """Return pixels of points, or of boxes' corners, and the function that makes such numbers of moved ones.
 
-    Rows of -1 have no place: they are NaN. centre: of the first pixel, in the given numbers.
+    Rows of -1 have no place: they are NaN. centre: that of the first pixel, in such numbers.
     """
 
     def numbers_of(moved: Tensor) -> Tensor:
         lost = ((moved == -1) | moved.isnan()).all(-1, keepdim=True)
         return torch.where(lost, -1.0, moved + centre)
 
-    return torch.where((given == -1).all(-1, keepdim=True), torch.nan, given - centre), numbers_of
+    return torch.where((numbers == -1).all(-1, keepdim=True), torch.nan, numbers - centre), numbers_of
 
 
-def _read_boxes(given: Tensor, leaf: Any, name: str) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+def _read_boxes(numbers: Tensor, leaf: Any, name: str) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
     """Return pixels x1, y1, x2, y2 of numbers of a leaf's format, and the function that makes such numbers of them."""
     form, corners_form = leaf.format, tv_tensors.BoundingBoxFormat.XYXY
     is_whole, convert = not leaf.is_floating_point(), v2.functional.convert_bounding_box_format
-    if given.shape[-1] > 4:
+    if numbers.shape[-1] > 4:
         raise ValueError(
             f"{_OWNER}: {name} must be boxes without rotation; got BoundingBoxes of the format {form.value}. To move "
             "them, pass their corners as keypoints"
         )
-    corners = convert(given, form, corners_form)
+    corners = convert(numbers, form, corners_form)
     pixels, corners_of = _read_points(corners.trunc() if is_whole else corners, 0.5)  # as torchvision reads whole ones
 
     def numbers_of(moved: Tensor) -> Tensor:
