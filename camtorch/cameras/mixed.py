@@ -89,7 +89,7 @@ class Mixed(Camera):
     def __init__(self, cameras: Iterable[Camera], *, order: Sequence[int] | None = None):
         members = _members(cameras, "Mixed")
         given = [(i, row) for i, camera in enumerate(members) for row in range(_count(camera))]
-        super(Camera, self).__init__()  # it has no numbers of its own
+        super(Camera, self).__init__()  # a Mixed has no numbers of its own
         self.cameras = nn.ModuleList(members)
         self.image_size: tuple[int, int] | None = members[0].image_size
         # for each row of the batch the place of its member in `cameras`, and the row there

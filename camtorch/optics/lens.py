@@ -226,7 +226,7 @@ class PlanarAt(StageAt):
         if stage.tangential:
             px, py = stage.tangential
             px, py = 2 * px, 2 * py
-            # this is the gradient of (p . m) t, so its Jacobian is symmetric
+            # the decentering term is the gradient of (p . m) t, so its Jacobian is symmetric
             ua = torch.addcmul(ua + self.twice_dot, a, 2 * px)
             vb = torch.addcmul(vb + self.twice_dot, b, 2 * py)
             ub = va = torch.addcmul(torch.addcmul(ub, b, px), a, py)

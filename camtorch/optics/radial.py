@@ -80,7 +80,7 @@ class Polynomial(RadialFactor):
 
     def derivatives(self, t: Tensor, order: int) -> tuple[Tensor, ...]:
         """Return R and its first `order` derivatives by t by Horner's scheme, extended to Taylor coefficients at t."""
-        # a zero stays a number as long as it can: the highest powers have no such terms, and cost nothing
+        # a derivative that is 0 stays a float: the highest powers have no terms of it, and cost nothing
         taylor: list[Any] = [self.parameters[-1]] + [0.0] * order
         lower: tuple[Any, ...] = (*reversed(self.parameters[:-1]), 1.0)
         for c in lower:
@@ -234,7 +234,7 @@ class RadiusTable(RadialFactor):
         slopes = _slopes(steps, secants)
         before, after = slopes[..., :-1], slopes[..., 1:]
         squares = (3 * secants - 2 * before - after) / steps
-        # it is zero in the first piece unless the filter changed it: the axis would divide its rounding by zero
+        # squares are 0 in the first piece unless the filter changed it: at the axis their rounding is divided by zero
         first = (squares * steps).abs() < 64 * torch.finfo(steps.dtype).eps * secants.abs()
         squares = torch.where(first & (radii[..., :-1] == 0), 0.0, squares)
         cubes = (before + after - 2 * secants) / (steps * steps)

@@ -21,7 +21,7 @@ from camtorch.values.arguments import columns
 RADII = 1024  # at which a factor is followed to its fold
 _PARTS = 256  # of the interval with a fold, divided twice before the secant
 TABLE_WIDTH = 2 + 2 * NODES  # columns of `tabulate`
-_LIMITING = 16  # roots of a radius, to one whose image is a number
+_LIMITING = 16  # square roots of a radius, the most that are taken until its image is a number
 _HALF_WAY = 2.0  # the squared radius in the middle of the table of a lens that never folds
 MOST_STEPS = 5  # of Newton's method; slower methods finish what still moves
 WITHOUT_FLOAT64 = ("mps",)  # types of devices
@@ -64,7 +64,7 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
     """
     if radial.fold is not None:
         return radial.fold.clamp(max=end)
-    # it is searched for if the numbers are not known
+    # the fold is searched for if the numbers are not known
     k = radial.parameters[0]
     known = k.dtype == torch.float64 and not k.is_meta
     if known and (fold := radial.closed_fold()) is not None:

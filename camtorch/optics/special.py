@@ -61,7 +61,7 @@ def _blend_series(t: Tensor, series: list[float], closed_form: Callable[[Tensor]
 
 def root(square: Tensor) -> Tensor:
     """Return the square root, with a finite derivative at zero."""
-    # this adds nothing to 1, and 1 / root^4 is still a number
+    # the tiny number adds nothing to 1, and the reciprocal of its square is still a number
     return plus(square, torch.finfo(square.dtype).tiny ** 0.5).sqrt()
 
 

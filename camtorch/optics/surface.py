@@ -31,7 +31,7 @@ class SurfaceAt(StageAt):
         controls = stage.parameters
         points = torch.stack(controls, -1).unflatten(-1, (len(controls) // 2, 2)).flatten(0, -2)
         (i, wa, da), (j, wb, db) = self._place(0), self._place(1)
-        # each camera, or point, has its own
+        # each camera, or point, has its own control points
         first = (torch.ones_like(controls[0], dtype=torch.int64).flatten().cumsum(0) - 1).view(controls[0].shape)
         index = first * (stage.columns * stage.rows) + j * stage.columns + i
         steps = torch.arange(stage.order + 1, device=index.device)

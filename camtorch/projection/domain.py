@@ -24,10 +24,11 @@ if TYPE_CHECKING:
     from camtorch.optics.model_spec import Optics
 
 _AT_ONCE = 6  # cameras whose azimuths are followed together
-_STEPS = 129
+_STEPS = 129  # radii at which the bounds of stages after a radial one are taken
+_WIDER = 1.25  # times the edge of the radial stage, up to there
 # Stages after a radial one that change distances by less than a quarter, and so move points by less than that, are
 # inverted by Newton's method from anywhere: each step leaves at most 2/3 of the distance
-_LEAST_SLOPE, _WIDER = 0.75, 1.25
+_LEAST_SLOPE = 0.75
 
 InverseBy = Literal["radius", "stages", "plane", "either"]
 """How lenses are inverted: along the radius, by stages, in the plane, or either of the last two, as their camera asks.

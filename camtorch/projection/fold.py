@@ -37,11 +37,11 @@ def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
     followed = _follow(chart, lens, rows, *directions)
     lost, reach, *rim = (w.unflatten(0, (-1, AZIMUTHS)) for w in followed)
     pairs = torch.stack((lost, lost.roll(-1, -1)), -1).flatten(0, 1)
-    # (M,): the radius between two azimuths before which the orientation decides; radii (M, S), lost (M, 2) on both
+    # for each azimuth and the next, (M, 2), the radius at which the lens is lost
     ends = _radius_at(rows, pairs)
     nearer, further = ends.amin(-1), ends.amax(-1)
     # Between two azimuths the fold moves smoothly, and may bulge: the orientation decides where it lies.
-    # If it ends there, the nearer one is on the safe side.
+    # If the fold ends there, the nearer radius is on the safe side.
     smooth = (pairs.diff(dim=-1).squeeze(-1).abs() <= 1.5) | (further <= (1 + SMOOTH) * nearer)
     limit = torch.where(smooth, further * (1 + BULGE), nearer).unsqueeze(-1)
     limits = limit.clamp(max=chart.end(limit.dtype)).squeeze(-1).unflatten(0, (-1, AZIMUTHS))
@@ -105,7 +105,7 @@ def _envelope(furthest: Tensor, x: Tensor, y: Tensor) -> Tensor:
         between = (step >= turn.clamp(max=0) - ASIDE) & (step <= turn.clamp(min=0) + ASIDE)
         direction = (here + step).remainder(AZIMUTHS)
         envelope = envelope.scatter_reduce(-1, direction, torch.where(between, level, 0.0), "amax")
-    # it becomes a circle if the rim has no end, turns by leaps, or is not seen to go once around the centre
+    # the envelope becomes a circle if the rim has no end, turns by leaps, or is not seen to go once around the centre
     leaps = (level == torch.inf) | (turn.abs() > SPAN - ASIDE) | (turn.sum(-1, keepdim=True) != AZIMUTHS)
     circle = torch.where(leaps.any(-1, keepdim=True), level.amax(-1, keepdim=True), 0.0)
     return BEYOND * torch.maximum(envelope, circle)

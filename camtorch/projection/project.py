@@ -31,7 +31,7 @@ def _normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor, looks: bool) -> tu
     ends = size.aminmax() if looks else None
     is_valid = ends is not None and bool(ends[0] > least) and bool(ends[1] < torch.inf)
     valid = None if is_valid else ((size > least) & (size < torch.inf)).to(size.dtype)
-    # it is a constant: the projection does not depend on the distance, so it has no part in the derivative
+    # the factor is a constant: the projection does not depend on the distance, which has no part in the derivative
     shrink = as_kept(power_of_two(replace(valid, size, 1.0)).reciprocal())
 
     def shrunk(*ray: Tensor) -> list[Tensor]:

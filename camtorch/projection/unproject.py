@@ -45,7 +45,7 @@ def invert(domain: Domain, u: Tensor, v: Tensor) -> Found:
     found = _invert_in_plane(domain, u, v)
     if by == "plane":
         return found
-    # choose for each camera, so that it does not depend on its batch
+    # choose for each camera, so that a result is the same in any batch
     pairs = zip(_invert_stagewise(domain, u, v), found, strict=True)
     return Found(*(torch.where(domain.stagewise, stagewise, planar) for stagewise, planar in pairs))
 

@@ -187,7 +187,7 @@ class BatchedModule(GeometryModule):
 
     tensor_names: ClassVar[tuple[str, ...]]
     """Names of the tensors (*B, n); a shared one may have fewer batch dims, or dims of size 1."""
-    memo_names: ClassVar[tuple[str, ...]] = ()  # results kept of their values, without which another module begins
+    memo_names: ClassVar[tuple[str, ...]] = ()  # memos of results, which are empty in another module
 
     @property
     def batch_shape(self) -> torch.Size:
