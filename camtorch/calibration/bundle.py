@@ -26,7 +26,7 @@ from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, 
 from camtorch.native.structs import LOST
 from camtorch.poses.rotations import small_turn
 from camtorch.projection import native_calls
-from camtorch.projection.evaluation import compiled_of
+from camtorch.projection.evaluation import native_forms
 from camtorch.projection.rows import CameraRows
 from camtorch.values.module import remade
 
@@ -172,7 +172,7 @@ def minima(
     """Return the poses (K, 1) of least cost near the given ones, each a problem of its own, and their costs (K,)."""
     points, pixels, weights = seen.points, seen.pixels, seen.seen.to(seen.pixels)
     camera = remade(_template(model, parameters), intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
-    if (made := compiled_of([camera], pixels)) is not None:
+    if (made := native_forms([camera], pixels)) is not None:
         search = compiled_poses.Search(steps, SETTLED, _NOTHING, FIRST_DAMPING, *loss)
         start = poses.rotations[:, 0], poses.translations[:, 0]
         rotations, translations, cost = compiled_poses.refine_poses(made[0][0], points, pixels, weights, start, search)
@@ -249,7 +249,7 @@ class Bundle:
         self.is_bent = free.bend or bool((state.bend != 0).any())
         # native code knows one camera that sees flat boards at unknown poses
         plain = len(observed) == 1 and free.boards == "poses" and not (free.mounts[0] or self.is_bent)
-        self.is_plain = plain and compiled_of(self.cameras, self.observed[0].pixels) is not None
+        self.is_plain = plain and native_forms(self.cameras, self.observed[0].pixels) is not None
         self.width = 6 if free.boards == "poses" else 3  # of the unknowns of a view
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.observed]).any(0).sum()
         self.unknowns = len(self.columns) + self.width * int(views)
@@ -464,7 +464,7 @@ def pixel_jacobians(camera: Camera, points: Tensor, learns: bool = True) -> tupl
 
     (C, N, 2, 3) and (C, N, 2, 4 + n): zero if a point has no pixel, and without meaning if it is not valid.
     """
-    made = compiled_of([camera], points)
+    made = native_forms([camera], points)
     if made is not None and (not learns or made[0][0].plan.places is not None):
         plan = made[0][0].plan
         by_point, by_own = (

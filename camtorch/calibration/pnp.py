@@ -18,7 +18,7 @@ from camtorch.calibration.rays import poses_from_rays
 from camtorch.cameras.camera import Camera
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, rotation_vector, skew_matrix
-from camtorch.projection.evaluation import compiled_of
+from camtorch.projection.evaluation import native_forms
 from camtorch.values.arguments import Numbers, as_number, broadcast_shapes, hinting, no_camera, working_dtype
 from camtorch.values.module import model_of, remade
 from camtorch.values.threads import on_one_thread
@@ -194,7 +194,7 @@ class _Given(NamedTuple):
 
 def _solve_compiled(given: _Given, threshold: float | None) -> Solved | None:
     points, pixels = given.points.detach(), given.pixels.detach()
-    if not len(pixels) or (made := compiled_of([given.camera], pixels)) is None:
+    if not len(pixels) or (made := native_forms([given.camera], pixels)) is None:
         return None
     weights = None if given.weights is None else given.weights.detach()
     start = None if threshold is None else _consensus(_Task.of(given), threshold)

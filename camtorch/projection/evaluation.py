@@ -60,7 +60,7 @@ def evaluate_rows(
 ) -> tuple[Tensor, Tensor]:
     """Return planes (size_out, C, N), and valid (C, N), for rows (C, N, size) seen by cameras of a model.
 
-    It decides whether native code or torch evaluates a direction; `compiled_of` decides for warps, poses and boards.
+    It decides whether native code or torch evaluates a direction; `native_forms` decides for warps, poses and boards.
     The cameras have the `tensors` (*B, 4) and (*B, n); `lead` are the batch dims that C counts. `cameras_of` returns
     the results kept of them as (C, 4) and (C, n). `constant` is the camera that they are of, if an exported program
     may hold it as a constant.
@@ -96,8 +96,8 @@ def evaluate_rows(
     return planes, valid
 
 
-def compiled_of(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Native], bool] | None:
-    """Return the native geometry of cameras, each (B,) or single, and whether any of them is a batch.
+def native_forms(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[Native], bool] | None:
+    """Return the native forms of cameras, each (B,) or single, and whether any of them is a batch.
 
     None if `evaluate_rows` would record values of the first one's dtype, for several models, and with a shutter.
     """

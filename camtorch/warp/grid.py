@@ -28,7 +28,7 @@ from camtorch.native.structs import (
     SURFACE,
 )
 from camtorch.poses.rotations import turn
-from camtorch.projection.evaluation import compiled_of
+from camtorch.projection.evaluation import native_forms
 from camtorch.projection.native_calls import NativeMove
 from camtorch.values.arguments import columns
 from camtorch.values.threads import on_one_thread
@@ -140,7 +140,7 @@ def _row_by_row(cameras: Between, rows: range) -> tuple[Tensor, Tensor]:
 
 def native_move(start: Camera, end: Camera, rotation: Tensor | None, like: Tensor) -> NativeMove | None:
     """Return the native geometry from camera to camera for pixels of the dtype of `like`; None in a graph."""
-    made = compiled_of((start, end), like, *(() if rotation is None else (rotation,)))
+    made = native_forms((start, end), like, *(() if rotation is None else (rotation,)))
     if made is None:
         return None
     (one, other), is_batch = made

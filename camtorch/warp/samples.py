@@ -16,7 +16,7 @@ from camtorch.evaluate.kept import Kept
 from camtorch.native import memory, structs
 from camtorch.native.library import loaded
 from camtorch.native.sampler import describe, is_quick, maker, takes, tiles_of
-from camtorch.projection.evaluation import compiled_of
+from camtorch.projection.evaluation import native_forms
 from camtorch.projection.native_calls import Lattices, NativeMove, run_and_follow
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
@@ -46,7 +46,7 @@ def natives_of(warp: CameraPair) -> tuple[Native, Native, Tensor | None] | None:
     source, target, rotation = warp.source, warp.target, warp.rotation
     if not warp.moves_by_cameras or warp.is_pinned or goes_round(source) is not None or goes_round(target) is not None:
         return None
-    made = compiled_of((source, target), target.intrinsics, *(() if rotation is None else (rotation,)))
+    made = native_forms((source, target), target.intrinsics, *(() if rotation is None else (rotation,)))
     return None if made is None else (*made[0], rotation)  # type: ignore[return-value]
 
 
