@@ -113,10 +113,10 @@ class Transform(FrontEnd):
                 f"{_OWNER}: sample must be a dict, or keywords as in transform(image=...); got {type(sample).__name__}"
             )
         sample = {**(sample or {}), **fields}
-        if sample.get("camera") is None and otherwise is not None:
-            sample["camera"] = otherwise
-        camera = self.augmentation.camera if sample.get("camera") is None else sample["camera"]
-        size = getattr(camera, "image_size", None)
+        camera = sample.get("camera")
+        if camera is None and otherwise is not None:
+            camera = sample["camera"] = otherwise
+        size = getattr(self.augmentation.camera if camera is None else camera, "image_size", None)
         form = _form_of(sample)
         if form is None:
             ways = self._ways(sample, size)
@@ -128,7 +128,7 @@ class Transform(FrontEnd):
         for of_field in read.values():
             tensors.update(of_field)
 
-        def written(moved: Sample) -> Sample:
+        def write(moved: Sample) -> Sample:
             result = {
                 name: way.write(moved, sample[name])
                 for name, way in ways.items()
@@ -140,7 +140,7 @@ class Transform(FrontEnd):
                     result[name] = value[0] if name.endswith(_VALID) and value.ndim == 3 else value
             return result
 
-        return tensors, written
+        return tensors, write
 
     def _kind(self, name: str, value: Any, sample: Mapping[str, Any]) -> str | None:
         """Return the kind of a field, or of the field whose validity it is; None if it is not moved."""
@@ -187,15 +187,13 @@ def _way_of_numbers(name: str, value: Any, kind: str | None) -> Way:
 
 def _way_of_image(name: str, value: Any, size: tuple[int, int] | None) -> Way:
     """Return the way of an array (H, W) or (H, W, C) of an image, a mask or a depth, or of its flags."""
-
-    def array(given: Any) -> Any:
-        return np.asarray(given, bool) if name.endswith(_VALID) else given
+    are_flags = name.endswith(_VALID)
 
     def read(given: Any) -> Sample:
-        return {name: as_planes(array(given), name, _OWNER, size)}
+        return {name: as_planes(np.asarray(given, bool) if are_flags else given, name, _OWNER, size)}
 
     def write(moved: Sample, given: Any) -> Any:
-        return as_array(moved[name], array(given))
+        return as_array(moved[name], np.asarray(given, bool) if are_flags else given)
 
     read(value)  # raises if it is none
     if not _is_shared(name, value):
