@@ -1,6 +1,6 @@
-"""kornia's containers of camera augmentations: dicts move whole, and params carry cameras and boxes of the samples.
+"""kornia's containers of camera augmentations, in which dicts move whole.
 
-In containers that hold one of them, this module wraps methods of kornia's:
+In containers that hold one of them, `wrap_containers` wraps methods of kornia's:
 
 * `forward` and `inverse`, since fields of a dict that kornia does not know would stay as they are, without a warning;
 * `_preproc_boxes`, since kornia takes no boxes of zeros, which it makes of those that are lost;
@@ -10,9 +10,8 @@ In containers that hold one of them, this module wraps methods of kornia's:
 from __future__ import annotations
 
 import functools
-import zlib
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import torch
 from kornia.augmentation import AugmentationSequential, IntensityAugmentationBase2D
@@ -20,114 +19,16 @@ from kornia.augmentation.container.image import ImageSequential
 from kornia.constants import DataKey
 from kornia.geometry.boxes import Boxes
 from torch import Tensor, nn
-from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch import augment
 from camtorch.augment.change import Change
 from camtorch.augment.fields import OWN
 from camtorch.augment.front_end import FrontEnd
-from camtorch.augment.kornia_parts import BasicAugmentationBase, ParamItem
+from camtorch.augment.kornia_parts import BasicAugmentationBase
 from camtorch.augment.matrices import Guess, pinhole_of_matrix
 from camtorch.augment.names import is_text, kind_of
+from camtorch.augment.params import Params, parts_of, with_cameras
 from camtorch.augment.sample import Sample, Single, detached, on_samples
-from camtorch.cameras.camera import Camera
-from camtorch.cameras.mixed import collate_cameras
-from camtorch.evaluate.door import pytree
-from camtorch.values.arguments import as_values, check_boxes, shown
-from camtorch.values.module import remade
-
-Params: TypeAlias = dict[str, Tensor]
-KIND = "source_kind"
-_NUMBERS = "source_intrinsics", "source_distortion"
-
-
-def with_boxes(params: Any, boxes: Tensor) -> Any:
-    """Return params with the boxes (B, 4) that a `BoxCrop` crops, x1, y1, x2, y2, for an augmentation or a container.
-
-    `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_boxes(params, boxes))`.
-
-    Raises:
-        ValueError: If the boxes have another shape or number, or the params are not those of a `BoxCrop`.
-    """
-    given = as_values(boxes, "boxes", "with_boxes")
-    check_boxes(given, "boxes", "with_boxes")
-    result, found = _edited(params, "box", "with_boxes: params must be those of a BoxCrop")
-    for part, name in found:
-        if tuple(given.shape) != (len(part[name]), 4):
-            raise ValueError(f"with_boxes: boxes must be ({len(part[name])}, 4); got {tuple(given.shape)}")
-        part[name] = given
-    return result
-
-
-def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
-    """Return params for images whose cameras differ in their numbers, for an augmentation or the list of a container.
-
-    `params = aug.forward_parameters(images.shape)`, then `aug(images, params=with_cameras(params, cameras))`.
-
-    Args:
-        params: the params, which are not changed.
-        cameras: a batch or list of cameras that differ only in their numbers. For a video, one for each clip or frame.
-
-    Raises:
-        ValueError: If the cameras are of another kind or number, or the params are not of a camera augmentation.
-        TypeError: If they are no cameras.
-    """
-    if isinstance(cameras, (list, tuple)) and all(isinstance(camera, Camera) for camera in cameras):
-        cameras = collate_cameras(cameras)
-    if not isinstance(cameras, Camera) or cameras.is_mixed:
-        raise TypeError(
-            f"with_cameras: cameras must be a batch, or a list, of one model and size; got {type(cameras).__name__}"
-        )
-    result, found = _edited(params, KIND, "with_cameras: params must be those of a camera augmentation")
-    for part, name in found:
-        kinds, kind, batch = part[name], kind_of_camera(cameras), tuple(cameras.batch_shape)
-        if len(kinds) and kinds[0].tolist() != kind:
-            raise ValueError(f"with_cameras: cameras must be of the params' model and image_size; got {cameras!r:.200}")
-        count, clips = len(kinds), int(part.get("video_batch_size", len(kinds)))
-        if batch not in ((), (1,), (count,), (clips,)):
-            raise ValueError(f"with_cameras: cameras must be {count}, one for each sample; got batch dims {batch}")
-        frames = count // clips if batch == (clips,) and clips else 1
-        for key, numbers in zip(_NUMBERS, (cameras.intrinsics, cameras.distortion), strict=True):
-            part[key] = numbers.expand(*(batch or (1,)), -1).repeat_interleave(frames, 0).expand(count, -1)
-    return result
-
-
-def _edited(params: Any, name: str, need: str) -> tuple[Any, list[tuple[Params, str]]]:
-    """Return a copy of params, and the dicts in it that hold `name`, each with its key; raise if there are none."""
-    result = pytree.tree_map(lambda value: value, params)
-    found = [(part, key) for _, part in _parts(result) for key in part if key.rpartition(".")[2] == name]
-    if not found:
-        raise ValueError(f"{need}; got {shown(params)}")
-    return result, found
-
-
-def _parts(params: Any, module: nn.Module | None = None) -> Iterator[tuple[Any, Params]]:
-    """Yield the params of single augmentations, in order, with the augmentation if they are those of `module`."""
-    if isinstance(params, dict):
-        yield module, params
-    for item in params if isinstance(params, (list, tuple)) else ():
-        if isinstance(item, ParamItem):
-            yield from _parts(item.data, None if module is None else module.get_submodule(item.name))
-
-
-def camera_with_params(params: Params, camera: Camera, device: torch.device | None) -> Camera:
-    """Return the camera with the numbers that the params carry, by default those that it has."""
-    numbers = camera.intrinsics, camera.distortion
-    device = camera.intrinsics.device if device is None else device
-    intrinsics, distortion = (params.get(n, value).to(device) for n, value in zip(_NUMBERS, numbers, strict=True))
-    same = intrinsics is numbers[0] and distortion is numbers[1]
-    return camera if same else remade(camera, intrinsics=intrinsics, distortion=distortion)
-
-
-_CODES: dict[str, int] = {}  # of names of models; compilers, which do not know zlib, look them up
-
-
-def kind_of_camera(camera: Camera) -> list[int]:
-    """Return model, number of coefficients and image_size as integers, since params hold only tensors."""
-    model = type_before_parametrizations(camera).__name__
-    if model not in _CODES:
-        _CODES[model] = zlib.crc32(model.encode())
-    return [_CODES[model], camera.distortion.shape[-1], *(camera.image_size or (0, 0))]
 
 
 class _Dict(NamedTuple):
@@ -220,7 +121,7 @@ def _with_fields(
     if (camera := _given_camera(self, read, ours)) is not None and not back:
         params = _params_for(self, camera, read.image, params)
     result, fields = call(self, read.rest, params=params), read.fields
-    applied = [pair for pair in _parts(self._params if params is None else params, self) if pair[0] in ours]
+    applied = [pair for pair in parts_of(self._params if params is None else params, self) if pair[0] in ours]
     for part, drawn in reversed(applied) if back else applied:
         fields = _moved(part, fields, drawn, read.kinds, back) if read.kinds else fields
         if read.camera is not None:
@@ -246,7 +147,7 @@ def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: Data
 def _put(of: type[nn.Module], name: str, by: Callable[..., Any]) -> None:
     """Replace method `name` of the class `of` by `by(old, container, *args)`, for containers of our augmentations."""
     call = getattr(of, name)
-    call = getattr(call, "__wrapped__", call)  # this module may be imported again
+    call = getattr(call, "__wrapped__", call)  # modules may be imported again
 
     @functools.wraps(call)
     def method(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -256,7 +157,9 @@ def _put(of: type[nn.Module], name: str, by: Callable[..., Any]) -> None:
     setattr(of, name, method)
 
 
-_put(AugmentationSequential, "forward", functools.partial(_with_fields, back=False))
-_put(AugmentationSequential, "inverse", functools.partial(_with_fields, back=True))
-_put(AugmentationSequential, "_preproc_boxes", _lost_stay_lost)
-_put(ImageSequential, "__getstate__", lambda call, self: detached(call(self)))
+def wrap_containers() -> None:
+    """Wrap the methods of kornia's containers; see the module."""
+    _put(AugmentationSequential, "forward", functools.partial(_with_fields, back=False))
+    _put(AugmentationSequential, "inverse", functools.partial(_with_fields, back=True))
+    _put(AugmentationSequential, "_preproc_boxes", _lost_stay_lost)
+    _put(ImageSequential, "__getstate__", lambda call, self: detached(call(self)))
