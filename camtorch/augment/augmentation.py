@@ -14,7 +14,7 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.cameras import known_camera
-from camtorch.augment.change import Change, Part, by_kinds, check_sizes, one_or_batch
+from camtorch.augment.change import Change, Part, by_models, check_sizes, one_or_batch
 from camtorch.augment.devices import Elsewhere, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
 from camtorch.augment.filling import enough, filled, scaled
@@ -230,7 +230,7 @@ class Augmentation(SampleTransform):
         gate = applied if chosen is None and self.p != 1 else None
         if not isinstance(camera, Mixed):
             return Change(count, [self._part(camera, draw)], gate=gate)
-        return by_kinds(count, camera, lambda rows, source: self._part(source, rows_of(draw, rows)), gate)
+        return by_models(count, camera, lambda rows, source: self._part(source, rows_of(draw, rows)), gate)
 
     def _change_of_some(self, camera: Camera, draw: Mapping[str, Any], chosen: Sequence[bool]) -> Change:
         """Return the change that moves only the chosen samples."""
@@ -244,7 +244,7 @@ class Augmentation(SampleTransform):
                     part = self._part(source, rows_of(draw, samples)) if moves else Part(source)
                     parts.append(replace(part, rows=samples))
         check_sizes((part.image_size for part in parts), self._name)
-        return Change(count, parts, mixed=isinstance(camera, Mixed))
+        return Change(count, parts, keeps_mixed=isinstance(camera, Mixed))
 
     def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
         """Return what parts of a `Compose` must do that this one, before `later` parts, does not; None if all is well.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, TypeVar
@@ -19,7 +20,7 @@ from camtorch.projection.evaluation import camera_rows
 from camtorch.projection.native_cameras import Native
 from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import remade
-from camtorch.warp.affine import AffineWarp, MirrorWarp, after, unchecked
+from camtorch.warp.affine import AffineWarp, UncheckedWarp, after, made_like
 from camtorch.warp.boxes import corners_of, in_order
 from camtorch.warp.options import Mode, Options
 from camtorch.warp.panorama import seam_of
@@ -43,30 +44,32 @@ def as_is(camera: Camera, rows: Tensor) -> Tensor:
 class LazyWarp:
     """A warp to cameras of which native code wrote the numbers; warp and cameras become modules at first use."""
 
-    keeps_lens: ClassVar[bool] = False  # these answer as a warp does
+    # what changes ask of a `Warp`, too
+    keeps_lens: ClassVar[bool] = False
     may_mirror: ClassVar[bool] = True
     moves_by_cameras: ClassVar[bool] = True
-    base: Camera  # of whose model the new cameras are
+    like: Camera  # the new cameras are of its model
     intrinsics: np.ndarray[Any, Any]  # (4,) of one, or (B, 4)
     distortion: np.ndarray[Any, Any]  # (n,) of one, or (B, n)
     image_size: tuple[int, int]
     rotation: Tensor | None  # (3, 3) or (B, 3, 3), or None
     options: Options  # of the warp
-    start: Native | None  # the cameras before, for native code
-    native: Native | None  # the new cameras for native code; None if they are not made yet
-    filled: Sequence[float]  # (2 B,): the factors on focal lengths that `min_filled` asks for, and what is filled then
-    is_turn: bool = True  # of a single one: whether the rotation is no mirror
-    made: Warp | None = field(default=None, init=False)  # the warp, from its first use on
-    own: Camera | None = field(default=None, init=False)  # the target, from its first use on
+    source_native: Native | None  # the cameras before, for native code
+    target_native: Native | None  # the new cameras, for native code; None if it does not have them
+    zooms: Sequence[float] = ()  # (B,): the factors on focal lengths that `min_filled` asks for; empty if it does not
+    filled: Sequence[float] = ()  # (B,): the part of each image that is filled then
+    is_turn: bool = True  # of a single rotation: whether it is no mirror
+    _warp: Warp | None = field(default=None, init=False)  # `warp()`, once it was called
+    _target: Camera | None = field(default=None, init=False)  # `target`, once it was read
 
     @property
     def target(self) -> Camera:
         """The new cameras of the change; samples get copies of them."""
-        if self.own is None:
-            if self.native is not None:
-                _ = self.native.lenses  # kept for cameras of the same numbers
-            self.own = self.new_target()
-        return self.own
+        if self._target is None:
+            if self.target_native is not None:
+                _ = self.target_native.lenses  # reading `lenses` stores them, so that the new camera finds them
+            self._target = self.new_target()
+        return self._target
 
     def new_target(self, count: int | None = None) -> Camera:
         """Return the new cameras, of memory of their own; a count makes a batch of a single one."""
@@ -78,16 +81,16 @@ class LazyWarp:
             numbers, k = (np.broadcast_to(each, (count, each.shape[-1])) for each in (numbers, k))
         intrinsics, distortion = torch.from_numpy(numbers.copy()).as_subclass(nn.Parameter), torch.from_numpy(k.copy())
         distortion = distortion.as_subclass(nn.Parameter) if k.shape[-1] else distortion
-        return remade(self.base, intrinsics=intrinsics, distortion=distortion, image_size=self.image_size)
+        return remade(self.like, intrinsics=intrinsics, distortion=distortion, image_size=self.image_size)
 
     def transform_positions(self, points: Tensor) -> Tensor:
         """Return points (B, *N, 3) of the source's frame in the target's."""
         return turn(self.rotation, points, "points")
 
     def warp(self, source: Camera) -> Warp:
-        if self.made is None:
-            self.made = MirrorWarp(source, self.target, self.rotation, **self.options)
-        return self.made
+        if self._warp is None:
+            self._warp = UncheckedWarp(source, self.target, self.rotation, **self.options)
+        return self._warp
 
 
 @dataclass(slots=True)
@@ -95,7 +98,7 @@ class Part:
     """Rows of a batch that move by one warp, or stay as they are."""
 
     camera: Camera  # before the change; the warp's source
-    moves: Warp | LazyWarp | None = None  # by what; None: nothing happens to these rows
+    moves: Warp | LazyWarp | None = None  # what the rows move by; None if nothing happens to them
     shades: tuple[Warp, Warp] | None = None  # how red and blue move, where they do not move as green
     light: Tensor | None = None  # (n or 1, 1, H', W'): what the lens lets through
     rows: list[int] | None = None  # which samples of the batch, or None for all
@@ -132,7 +135,7 @@ class Part:
         def optioned(warp: Warp) -> Warp:
             if warp.options == options:
                 return warp
-            return unchecked(warp, warp.source, warp.target, warp.rotation, options)
+            return made_like(warp, warp.source, warp.target, warp.rotation, options)
 
         return self.with_warps(optioned)
 
@@ -169,11 +172,11 @@ class Part:
                 "whose colours or light would be seen through another lens"
             )
         if isinstance(last, LazyWarp) and not self.camera.batch_shape:
-            start = first.start if isinstance(first, LazyWarp) else _single(self.camera)
+            native = first.source_native if isinstance(first, LazyWarp) else _single(self.camera)
             is_turn = rotation is None or (rotation.ndim == 2 and is_right(rotation))
-            moves = replace(last, rotation=rotation, start=start, is_turn=is_turn)
+            moves = replace(last, rotation=rotation, source_native=native, is_turn=is_turn)
             return replace(second, camera=self.camera, moves=moves)
-        moved = second.with_warps(lambda warp: MirrorWarp(self.camera, warp.target, rotation))
+        moved = second.with_warps(lambda warp: UncheckedWarp(self.camera, warp.target, rotation))
         return replace(moved, camera=self.camera)
 
     def _edited(self, edit: AffineWarp, rotation: Tensor | None) -> Part:
@@ -183,7 +186,7 @@ class Part:
             matrix = after(edit.map, self.moves.map)
             return replace(self, moves=AffineWarp(self.camera, edited(self.camera, matrix, size), matrix, rotation))
         light = None if self.light is None else edit(self.light, padding_mode="border")
-        moved = self.with_warps(lambda warp: MirrorWarp(self.camera, edited(warp.target, edit.map, size), rotation))
+        moved = self.with_warps(lambda warp: UncheckedWarp(self.camera, edited(warp.target, edit.map, size), rotation))
         return replace(moved, light=light)
 
 
@@ -209,18 +212,18 @@ class Change:
     Args:
         count: how many samples.
         parts: every sample is in one of them.
-        mixed: whether the cameras came as a `Mixed`, and come out so, be they of one model.
+        keeps_mixed: return a `Mixed`, as the cameras came, even if all cameras are of one model.
         gate: (count,) bool, where values may not be looked at: which rows of the only part move.
     """
 
-    __slots__ = ("_inverse", "_order", "count", "gate", "mixed", "parts")
+    __slots__ = ("_inverse", "_order", "count", "gate", "keeps_mixed", "parts")
     count: int
     parts: list[Part]
-    mixed: bool
+    keeps_mixed: bool
     gate: Tensor | None
 
-    def __init__(self, count: int, parts: Sequence[Part], *, mixed: bool = False, gate: Tensor | None = None):
-        self.count, self.parts, self.mixed, self.gate = count, list(parts), mixed, gate
+    def __init__(self, count: int, parts: Sequence[Part], *, keeps_mixed: bool = False, gate: Tensor | None = None):
+        self.count, self.parts, self.keeps_mixed, self.gate = count, list(parts), keeps_mixed, gate
         self._inverse: Change | None = None
         self._order: list[int] | None = None
         if self.parts[0].rows is not None:
@@ -254,7 +257,7 @@ class Change:
         check_sizes(camera.size_for("Change") for camera in cameras)
         together = Mixed.of_groups(list(zip(rows, batches, strict=True)))
         groups = together.groups
-        return together if self.mixed or len(groups) > 1 else groups[0][1]
+        return together if self.keeps_mixed or len(groups) > 1 else groups[0][1]
 
     def _in_order(self, pieces: Sequence[Tensor]) -> Tensor:
         """Return rows, given part by part, as a batch of all samples."""
@@ -272,7 +275,7 @@ class Change:
         if isinstance(moves := first.moves, LazyWarp):
             if not batched and moves.intrinsics.ndim == 1:
                 return moves.new_target()
-            if batched and first.rows is None and not self.mixed:
+            if batched and first.rows is None and not self.keeps_mixed:
                 return moves.new_target(None if moves.intrinsics.ndim == 2 else self.count)
         if batched or self.gate is not None:
             return (self.target if batched else self.target[0]).clone()
@@ -330,27 +333,29 @@ class Change:
             raise ValueError(
                 "Compose: compiled code must have p=1 of all but edits, as it may not look at draws; got less"
             )
-        mixed = self.mixed or second.mixed
+        keeps_mixed = self.keeps_mixed or second.keeps_mixed
         if all(part.rows is None for part in (*self.parts, *second.parts)):
-            return Change(self.count, [self.parts[0].then(second.parts[0])], mixed=mixed)
+            return Change(self.count, [self.parts[0].then(second.parts[0])], keeps_mixed=keeps_mixed)
+
+        def places(change: Change) -> list[tuple[Part, dict[int, int]]]:
+            """Return each part, with where each of its samples is among its rows."""
+            rows = [range(self.count) if part.rows is None else part.rows for part in change.parts]
+            return [(part, {row: i for i, row in enumerate(its)}) for part, its in zip(change.parts, rows, strict=True)]
+
         parts = []
-        everyone = list(range(self.count))
-        for a in self.parts:
-            for b in second.parts:
-                own, its = (everyone if part.rows is None else part.rows for part in (a, b))
-                place = {row: i for i, row in enumerate(its)}
-                of_a = [i for i, row in enumerate(own) if row in place]
-                if of_a:
-                    rows = [own[i] for i in of_a]
-                    one = a if len(rows) == len(own) else a.take(of_a)
-                    other = b if rows == its else b.take([place[row] for row in rows])
-                    parts.append(replace(one.then(other), rows=rows))
-        return Change(self.count, parts, mixed=mixed)
+        for pairs in itertools.product(places(self), places(second)):
+            rows = [row for row in pairs[0][1] if row in pairs[1][1]]
+            if rows:
+                first, last = (
+                    part if rows == list(place) else part.take([place[row] for row in rows]) for part, place in pairs
+                )
+                parts.append(replace(first.then(last), rows=rows))
+        return Change(self.count, parts, keeps_mixed=keeps_mixed)
 
     def with_options(self, options: Options) -> Change:
         """Return the change with its warps made anew by other options."""
         parts = [part.with_options(options) for part in self.parts]
-        return Change(self.count, parts, mixed=self.mixed, gate=self.gate)
+        return Change(self.count, parts, keeps_mixed=self.keeps_mixed, gate=self.gate)
 
     def row(self, i: int) -> Change:
         """Return the change of one sample."""
@@ -367,7 +372,7 @@ class Change:
             part if part.moves is None else Part(part.target, part.warp.inverse(), rows=part.rows)
             for part in self.parts
         ]
-        self._inverse = Change(self.count, parts, mixed=self.mixed, gate=self.gate)
+        self._inverse = Change(self.count, parts, keeps_mixed=self.keeps_mixed, gate=self.gate)
         return self._inverse
 
     def each(
@@ -517,7 +522,7 @@ class Change:
         return self.each(depth, move)
 
 
-def by_kinds(
+def by_models(
     count: int, camera: Camera, part: Callable[[list[int] | None, Camera], Part], gate: Tensor | None = None
 ) -> Change:
     """Return the change of `count` samples, with one part for each camera model of the batch.
@@ -528,7 +533,7 @@ def by_kinds(
     if not isinstance(camera, Mixed):
         return Change(count, [part(None, camera)], gate=gate)
     parts = [replace(part(rows, source), rows=rows) for rows, source in camera.groups]
-    return Change(count, parts, mixed=True, gate=gate)
+    return Change(count, parts, keeps_mixed=True, gate=gate)
 
 
 def one_or_batch(camera: Camera | Sequence[Camera]) -> Camera:

@@ -18,13 +18,16 @@ from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import is_unknown
 from camtorch.native.library import native_available
 from camtorch.values.module import remade
-from camtorch.warp.affine import unchecked
+from camtorch.warp.affine import made_like
 
 _twins = Kept(16)
 
 
 def twin_of(camera: Camera) -> Camera | None:
-    """Return a copy on the CPU, kept until values change; None if it is there, learns or is traced, or without C."""
+    """Return a copy on the CPU, kept until values change.
+
+    None if the camera is on the CPU already, learns, is traced, or the library is missing.
+    """
     members = cast("list[Camera]", list(camera.cameras)) if isinstance(camera, Mixed) else [camera]
     if members[0].intrinsics.is_cpu or is_unknown(members[0].intrinsics) or not native_available():
         return None
@@ -57,21 +60,21 @@ class Elsewhere(Change):
     def __init__(self, host: Change, device: torch.device):
         with outside_inference():
             parts = _remade(host.parts, lambda numbers: sent(numbers, device))
-        super().__init__(host.count, parts, mixed=host.mixed)
+        super().__init__(host.count, parts, keeps_mixed=host.keeps_mixed)
         self.host, self._device = host, device
         self._wide: Change | None = None
 
     def each(
         self, value: Tensor, move: Callable[[Part, Tensor], TensorOrPair], stay: Callable[[Camera, Tensor], Any] = as_is
     ) -> TensorOrPair:
-        own = self.parts[0].camera.intrinsics.dtype
-        dtype = torch.promote_types(value.dtype, own) if value.dtype.is_floating_point else own
-        if dtype == own:
+        of_cameras = self.parts[0].camera.intrinsics.dtype
+        dtype = torch.promote_types(value.dtype, of_cameras) if value.dtype.is_floating_point else of_cameras
+        if dtype == of_cameras:
             return super().each(value, move, stay)
         # labels are computed in the wider dtype, and so are the cameras' tables
         if self._wide is None:
             wide = _remade(self.host.parts, lambda numbers: [t.to(dtype) for t in numbers])
-            self._wide = Elsewhere(Change(self.host.count, wide, mixed=self.host.mixed), self._device)
+            self._wide = Elsewhere(Change(self.host.count, wide, keeps_mixed=self.host.keeps_mixed), self._device)
         return self._wide.each(value, move, stay)
 
     def camera_for_sample(self, batched: bool) -> Camera:
@@ -97,6 +100,7 @@ def _remade(parts: Sequence[Part], change: Callable[[list[Tensor]], list[Tensor]
         given += [t for t in (part.rotation, part.light) if t is not None]
     numbers = iter(change(given))
 
+    # takes the next numbers, in the order in which `given` lists them
     def remade_as(camera: Camera) -> Camera:
         made = remade(camera, intrinsics=next(numbers), distortion=next(numbers))
         remember_camera(made, camera)
@@ -108,7 +112,7 @@ def _remade(parts: Sequence[Part], change: Callable[[list[Tensor]], list[Tensor]
         rotation, light = (None if t is None else next(numbers) for t in (part.rotation, part.light))
         warps = []
         for host, target in zip([part.warp, *(part.shades or ())], targets, strict=True) if targets else ():
-            warps.append(unchecked(host, source, target, rotation, host.options).follow_host(host))
+            warps.append(made_like(host, source, target, rotation, host.options).follow_host(host))
         shades = (warps[1], warps[2]) if part.shades else None
         made.append(replace(part, moves=warps[0] if warps else None, camera=source, shades=shades, light=light))
     return made

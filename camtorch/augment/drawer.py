@@ -202,12 +202,9 @@ class CameraDrawer(Augmentation):
         made = self._lazy_warp(source, values)
         if made is None:
             return self._part_by_torch(source, values)
-        if self.min_filled:
-            rows = len(made.filled) // 2
-            factor, found = made.filled[:rows], made.filled[rows:]
-            if min(found, default=1) < self.min_filled or max(factor, default=1) > 1:
-                self._tell_of(source, lambda: made.target, *map(torch.tensor, (factor, found)))
-        may_stay_lazy = made.native is not None and self.options["tolerance"] and not self.options["antialias"]
+        if self.min_filled and (min(made.filled, default=1) < self.min_filled or max(made.zooms, default=1) > 1):
+            self._tell_of(source, lambda: made.target, torch.tensor(made.zooms), torch.tensor(made.filled))
+        may_stay_lazy = made.target_native is not None and self.options["tolerance"] and not self.options["antialias"]
         if may_stay_lazy and self.beside_the_camera.isdisjoint(self.ranges):
             return Part(source, made)
         return self._part_between(source, made.target, made.rotation, values)

@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions, FlipOptions
-from camtorch.augment.change import Change, Part, by_kinds
+from camtorch.augment.change import Change, Part, by_models
 from camtorch.augment.landmarks import Mirroring, TableLike
 from camtorch.augment.ranges import Range, as_range, rows_of
 from camtorch.cameras.camera import Camera
@@ -109,7 +109,7 @@ def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, o
         warp = AffineWarp(source, edited(source, matrix, size), matrix, _turn(matrix, source), **options)
         return Part(source, warp)
 
-    return by_kinds(len(edits[0][1]["apply"]), camera, part)
+    return by_models(len(edits[0][1]["apply"]), camera, part)
 
 
 def _turn(matrix: Map, source: Camera) -> Tensor | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Set
 from ctypes import addressof, c_double, c_float
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -145,9 +145,8 @@ class Start:
         call.values, call.room = addressof(packed), addressof(room)
         if rows != 1:  # as they are one at first
             call.cameras = call.made.cameras = rows
-        filled: Sequence[float] = ()
         if self._share:
-            filled = shares = _array(c_double, 2 * rows)()  # the factors, and what is filled
+            shares = _array(c_double, 2 * rows)()  # the factors, and what is filled
             call.factors = addressof(shares)
             call.filled = call.factors + 8 * rows
         candidates = self._candidates(values, call) if rows and self._jitters and not self._c_makes_lenses else None
@@ -169,7 +168,8 @@ class Start:
             made = Native(native.plan, call.made, partial(self._lenses, call, numbers))
         elif serves and not batch:
             made = single_native(model_of(self.base), torch.from_numpy(intrinsics), torch.from_numpy(k))
-        return LazyWarp(base, intrinsics, k, self._size, rotation, options, self._before, made, filled)
+        shares = (shares[:rows], shares[rows:]) if self._share else ()
+        return LazyWarp(base, intrinsics, k, self._size, rotation, options, self._before, made, *shares)
 
     def _packed(self, values: Mapping[str, Any]) -> tuple[Any, tuple[int, ...]]:
         """Return drawn values kind after kind, as C takes them, and (B,); () for numbers and lists of one camera."""

@@ -90,7 +90,7 @@ class SamplePlan:
         target: Native | None
         options, turns, is_turn = moves.options, None, False
         if isinstance(moves, LazyWarp):
-            source, target, rotation, size = moves.start, moves.native, moves.rotation, moves.image_size
+            source, target, rotation, size = moves.source_native, moves.target_native, moves.rotation, moves.image_size
         elif part.shades or part.light is not None or (natives := natives_of(moves)) is None:
             return {}
         else:

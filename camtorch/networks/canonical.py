@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Change, Part, by_kinds, one_or_batch
+from camtorch.augment.change import Change, Part, by_models, one_or_batch
 from camtorch.augment.plan import Batch
 from camtorch.augment.sample import Sample, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
@@ -190,7 +190,7 @@ class CanonicalCamera(SampleTransform):
             options = {**self.options, "antialias": self.antialias}
             return Part(source, AffineWarp(source, edited(source, matrix, size), matrix, None, **options))
 
-        return by_kinds(count, camera, part)
+        return by_models(count, camera, part)
 
     def extra_repr(self) -> str:
         size = "" if self.image_size is None else f", image_size={self.image_size}"

@@ -40,7 +40,7 @@ Map = Tensor | Rows
 """(*B, 2, 3) float64, from pixels (u, v, 1) to pixels; `Rows` if one map, known while code is traced, serves all."""
 
 
-class Way(NamedTuple):
+class ImageEdit(NamedTuple):
     """The way an image is made: copied; resized by torch; or, without `move` and `box`, halved and sampled."""
 
     padding_mode: PaddingMode
@@ -50,8 +50,11 @@ class Way(NamedTuple):
     flips: tuple[int, ...] = ()  # dims to flip
 
 
-class MirrorWarp(Warp):
-    """A `Warp` whose rotation may be a mirror; antialias=None halves images that shrink by more than 1.5."""
+class UncheckedWarp(Warp):
+    """A `Warp` whose rotation is not checked, and may be a mirror.
+
+    antialias=None halves images that shrink by more than 1.5.
+    """
 
     may_mirror = True
     map: Map | None = None
@@ -65,10 +68,10 @@ class MirrorWarp(Warp):
         self._halvings: list[int] | None = None
 
     def warped(self, images: Tensor, sampler: Sampler, route: Route | None = None) -> Tensor:
-        """Return warped images; each one may be copied, resized, or halved and sampled, see `Way`."""
+        """Return warped images; each one may be copied, resized, or halved and sampled, see `ImageEdit`."""
         smooth = sampler.mode != "nearest" and images.dtype != torch.bool
         called = torch.compiler.is_compiling() and not torch.onnx.is_in_onnx_export()
-        if called and self._depends(smooth) and not keeps_graph(images, *self.tensors):
+        if called and self._ways_need_values(smooth) and not keeps_graph(images, *self.tensors):
             options = None if self._decides else self.antialias, sampler.padding_mode, sampler
             cameras = self.source, self.target, self.rotation
             matrix = None if self.map is None else as_tensor(self.map)
@@ -93,24 +96,24 @@ class MirrorWarp(Warp):
                 result[row] = one
         return result
 
-    def _depends(self, smooth: bool) -> bool:
-        """Whether the ways depend on traced values."""
+    def _ways_need_values(self, smooth: bool) -> bool:
+        """Whether the ways depend on values, which are not known while code is traced."""
         mixed = self.source.is_mixed or self.target.is_mixed
         return self._decides and smooth and self.moves_by_cameras and not mixed
 
-    def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[Way] | None:
+    def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[ImageEdit] | None:
         """Return the way of each row, or one for all; None to sample as any `Warp` does."""
         if not (self._decides and smooth and route == "kept" and are_known(self.target.intrinsics)):
             return None
         if self._halvings is None:
-            own = self.host or self  # the warp on the CPU, whose values need no wait
-            self._halvings = _halvings(own.positions("kept", sampler.padding_mode), own.sampled)
-        return [Way(sampler.padding_mode, k) for k in self._halvings] if any(self._halvings) else None
+            known = self.host or self  # the warp on the CPU, whose values need no wait
+            self._halvings = _halvings(known.positions("kept", sampler.padding_mode), known.sampled)
+        return [ImageEdit(sampler.padding_mode, k) for k in self._halvings] if any(self._halvings) else None
 
     def _made(
         self,
         images: Tensor,
-        way: Way,
+        way: ImageEdit,
         sampler: Sampler,
         route: Route,
         rows: Tensor | None = None,
@@ -160,7 +163,7 @@ class MirrorWarp(Warp):
         return type(self)(source, target, rotation=rotation, **{**self.own_parts(), **options})
 
 
-class AffineWarp(MirrorWarp):
+class AffineWarp(UncheckedWarp):
     """A `Warp` that edits the image of `source`: all its pixels move by an affine map, also those without a ray.
 
     Shifts by whole pixels, flips and quarter turns copy pixels bit by bit. `matrix`, (2, 3) or (B, 2, 3) float64 and
@@ -176,13 +179,13 @@ class AffineWarp(MirrorWarp):
     def __init__(self, source: Camera, target: Camera, matrix: Map, rotation: Tensor | None, **options: Any):
         super().__init__(source, target, rotation, **options)
         self.map = matrix
-        own = as_tensor(matrix)
+        given = as_tensor(matrix)
         device = source.intrinsics.device
-        dtype = torch.float32 if device.type in WITHOUT_FLOAT64 else own.dtype
-        self.register_buffer("matrix", own.to(device, dtype), persistent=False)
-        self.batch_shape: torch.Size = broadcast_shapes(self.batch_shape, own.shape[:-2])
+        dtype = torch.float32 if device.type in WITHOUT_FLOAT64 else given.dtype
+        self.register_buffer("matrix", given.to(device, dtype), persistent=False)
+        self.batch_shape: torch.Size = broadcast_shapes(self.batch_shape, given.shape[:-2])
         # the way depends on numbers on the CPU alone: it is the same on every device, and waits for none
-        self._numbers: list[Rows] = own.reshape(-1, 2, 3).tolist() if own is matrix and are_known(own) else []
+        self._numbers: list[Rows] = given.reshape(-1, 2, 3).tolist() if given is matrix and are_known(given) else []
         if not isinstance(matrix, Tensor):
             self._numbers = [matrix]
 
@@ -202,10 +205,10 @@ class AffineWarp(MirrorWarp):
         """Return this warp: pure copies need no sampling positions, others keep them from the first call."""
         return self
 
-    def _depends(self, smooth: bool) -> bool:
+    def _ways_need_values(self, smooth: bool) -> bool:
         return not self._numbers
 
-    def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[Way] | None:
+    def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[ImageEdit] | None:
         least: float = 1 if self.antialias else SHRINKS if self._decides else math.inf
         least, decides = least if smooth else math.inf, smooth and self._decides and route == "kept"
         sizes = self.source.size_for("Warp"), self.image_size
@@ -246,9 +249,9 @@ class AffineWarp(MirrorWarp):
         return placed(self.target, moved.to(torch.promote_types(pixels.dtype, torch.float32)), valid, on_image)
 
 
-def unchecked(warp: Warp, source: Camera, target: Camera, rotation: Tensor | None, options: Options) -> Warp:
+def made_like(warp: Warp, source: Camera, target: Camera, rotation: Tensor | None, options: Options) -> Warp:
     """Return a warp like another one between other cameras, of which neither cameras nor rotation are checked."""
-    make = MirrorWarp if warp.moves_by_cameras else warp.between
+    make = UncheckedWarp if warp.moves_by_cameras else warp.between
     return make(source, target, rotation, **options)
 
 
@@ -262,13 +265,13 @@ def _resized(images: Tensor, size: Sequence[int], mode: str = "bilinear", flips:
 
 def _way(
     rows: Rows, before: tuple[int, int], after: tuple[int, int], padding: PaddingMode, least: float, decides: bool
-) -> Way:
+) -> ImageEdit:
     """Return how a map edits images of size `before`; torch resizes them if more than `least` pixels become one."""
     (a, b, left), (c, d, top) = rows
     whole = tuple(round(x) for x in (a, b, left, c, d, top))
     near = all(abs(x - n) < _WHOLE for x, n in zip((a, b, left, c, d, top), whole, strict=True))
     if near and abs(a) + abs(b) == abs(c) + abs(d) == 1 and padding == "zeros":
-        return Way(padding, move=whole)
+        return ImageEdit(padding, move=whole)
     (a, b, left), (c, d, top) = inverted(rows)
     # two opposite corners of the edited image, from the outer corner of the source's first pixel
     corners = (-0.5, -0.5), (after[1] - 0.5, after[0] - 0.5)
@@ -278,10 +281,10 @@ def _way(
     box = tuple(round(edge) for edge in (x, y, right, bottom))
     near = all(abs(edge - n) < _NEARLY for edge, n in zip((x, y, right, bottom), box, strict=True))
     if near and is_inside and b == 0 and max(abs(a), abs(d)) > least:
-        return Way(padding, box=box, flips=tuple(dim for dim, sign in ((-1, a), (-2, d)) if sign < 0))
+        return ImageEdit(padding, box=box, flips=tuple(dim for dim, sign in ((-1, a), (-2, d)) if sign < 0))
     halvings = _halved((math.hypot(a, c) + math.hypot(b, d)) / 2) if decides else 0
     # inside of the source, up to the outer edges of its pixels, a target needs no padding
-    return Way("border" if is_inside and padding == "zeros" else padding, halvings)
+    return ImageEdit("border" if is_inside and padding == "zeros" else padding, halvings)
 
 
 def _halved(scale: float) -> int:
@@ -314,7 +317,7 @@ def _edited(
     *texts, matrix, is_last = options
     antialias, _, sampler = compiled.read(*texts)
     how: Any = {**sampler._asdict(), "antialias": antialias, "tolerance": tolerance}
-    warp: Warp = MirrorWarp(source, target, rotation, **how)
+    warp: Warp = UncheckedWarp(source, target, rotation, **how)
     if matrix is not None:
         warp = AffineWarp(source, target, matrix, rotation, **how)
     return (compiled.laid(warp(images), is_last),)

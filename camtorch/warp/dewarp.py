@@ -87,9 +87,9 @@ class Dewarp(Warp):
         **options: Unpack[TolerantOptions],
     ):
         one_of(projection, tuple(_PROJECTIONS), "projection", "Dewarp")
-        own = as_sized(camera, "camera", "Dewarp").size_for("Dewarp")
-        size = as_image_size(image_size, "Dewarp") or own
-        warn_of_exchange(own, size, "Dewarp", "warped")
+        source_size = as_sized(camera, "camera", "Dewarp").size_for("Dewarp")
+        size = as_image_size(image_size, "Dewarp") or source_size
+        warn_of_exchange(source_size, size, "Dewarp", "warped")
         rotation = as_rotation(rotation, "Dewarp")
         check_devices("Dewarp", camera=camera.intrinsics, rotation=rotation)
         model = _PROJECTIONS[projection][0]
