@@ -289,7 +289,7 @@ class Augmentation(SampleTransform):
 
     def _part_between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
         """Return the part from a source to a target; `values` may change images in more ways, such as their light."""
-        return Part(source, Warp(source, target, rotation, **self.options))
+        return Part(source, Warp(source, target, rotation, **self._warp_options))
 
     def _values_for(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
         """Return drawn values, (*B,) or (*B, size); without *B if all are alike, so that one map serves all samples."""
@@ -476,8 +476,8 @@ class Augmentation(SampleTransform):
     def extra_repr(self) -> str:
         parts = [f"camera={self.camera:g}"] if isinstance(self.camera, Guess) else []
         parts += [f"{name}={interval}" for name, interval in self.ranges.items()]
-        options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
-        return ", ".join(parts + [f"{name}={value!r}" for name, value in options.items()])
+        said = {"p": self.p, "same_on_batch": self.same_on_batch, **self._warp_options, "min_filled": self.min_filled}
+        return ", ".join(parts + [f"{name}={value!r}" for name, value in said.items()])
 
 
 def _chosen(applied: Any) -> list[bool] | None:

@@ -162,7 +162,6 @@ class Compose(Augmentation):
             part.tell_of_empty_images(camera)
 
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
-        options = {**self.options, "antialias": self.antialias}
         parts = self.parts
         total: Change | None = None  # of the parts so far; camera: that after them
         edits: list[tuple[Edit, Mapping[str, Any]]] = []
@@ -173,7 +172,7 @@ class Compose(Augmentation):
                 edits.append((part, part_draw))
                 if i + 1 < len(parts) and isinstance(parts[i + 1], Edit):
                     continue  # consecutive edits are one
-                step, edits = change_by(edits, camera, options), []
+                step, edits = change_by(edits, camera, self.options), []
             else:
                 if total is not None:
                     part_draw |= {name: _moved(total, part_draw[name], camera) for name in part.crops}
@@ -183,10 +182,10 @@ class Compose(Augmentation):
             camera = step.target if others or first.rows is not None else first.target
         assert total is not None
         check_sizes((part.image_size for part in total.parts), self._name)
-        return total.with_options(options)  # type: ignore[arg-type]
+        return total.with_options(self.options)
 
     def extra_repr(self) -> str:
-        options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "antialias": self.antialias}
+        options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())
 
 

@@ -228,7 +228,7 @@ class CameraDrawer(Augmentation):
             found = self._memo(tensors, key, start) if known is None else known[2]
         if found is None:
             return None
-        return found.warp(values, source if like is None and not self._is_real else found.base, self.options)
+        return found.warp(values, source if like is None and not self._is_real else found.base, self._warp_options)
 
     def _start(self, source: Camera, values: Mapping[str, Any]) -> Start | None:
         """Return what native code starts from for values of these names; None if it lacks a range, or a model."""
@@ -246,7 +246,7 @@ class CameraDrawer(Augmentation):
         cameras, light = [target], None
         if "chromatic" in beside:
             cameras += [scaled(target, 1 + beside["chromatic"][..., i]) for i in (0, 1)]
-        warp, *others = [Warp.unchecked(source, camera, self.options).turned_by(rotation) for camera in cameras]
+        warp, *others = [Warp.unchecked(source, camera, self._warp_options).turned_by(rotation) for camera in cameras]
         if "vignetting" in beside:
             light = falloff(target, beside["vignetting"])
         if "cos4" in beside:

@@ -21,6 +21,7 @@ from camtorch.cameras.editing import edited, quarter_turns
 from camtorch.evaluate.tensors import known_false, known_true
 from camtorch.values.arguments import as_known_size, as_whole
 from camtorch.warp.affine import AffineWarp, Map, Rows, after, as_tensor
+from camtorch.warp.options import Options
 
 Size = int | Sequence[int]
 
@@ -48,6 +49,10 @@ class Edit(Augmentation):
     needs_camera = False
     drawn_on_host = True
 
+    @property
+    def _warp_options(self) -> Any:
+        return self.options
+
     @abstractmethod
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         """Return the map of pixels, and the new size.
@@ -66,7 +71,7 @@ class Edit(Augmentation):
         return self.edit(size, nothing)[1]
 
     def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
-        return change_by([(self, draw)], camera, {**self.options, "antialias": self.antialias})
+        return change_by([(self, draw)], camera, self._warp_options)
 
     def map_of(self, draw: Mapping[str, Any], size: tuple[int, int]) -> tuple[Map | None, tuple[int, int]]:
         """Return the map of a draw for images of a size (None if it never applies), and the new size."""
@@ -87,11 +92,8 @@ class Edit(Augmentation):
         still = matrix.new_tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
         return torch.where(applied[:, None, None].to(matrix.device), matrix, still), new
 
-    def extra_repr(self) -> str:
-        return super().extra_repr().replace(f"antialias={bool(self.antialias)}", f"antialias={self.antialias}")
 
-
-def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, options: Mapping[str, Any]) -> Change:
+def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, options: Options) -> Change:
     """Return the change of `camera`'s images by edits and their draws, in order; `options` are those of warps."""
 
     def part(rows: list[int] | None, source: Camera) -> Part:

@@ -172,7 +172,9 @@ class RandomMount(CameraDrawer):
         part = super()._part(source, {name: v for name, v in draw.items() if name not in (*_SHIFTS, key)})
         shifts = [torch.as_tensor(draw[name], dtype=torch.float64) for name in _SHIFTS]
         shift = torch.stack(shifts, -1).expand(len(draw["apply"]), 3)
-        warp = ShiftedWarp(source, part.target, part.warp.rotation, draw[key], _DEPTHS[key][1], shift, **self.options)
+        warp = ShiftedWarp(
+            source, part.target, part.warp.rotation, draw[key], _DEPTHS[key][1], shift, **self._warp_options
+        )
         return replace(part, moves=warp)
 
 

@@ -134,7 +134,6 @@ class SampleTransform(KeepsCamera, nn.Module):
     """Whether pinhole cameras become pinhole cameras, as far as that is known before a draw."""
     mirroring: Mirroring | None = None
     """What changes places in a mirror; None if it never mirrors."""
-    _warps_decide: bool = False  # whether `antialias` is None
 
     def __new__(cls, *args: Any, **options: Any) -> Self:
         """Check the names of arguments, which Python would only call unexpected."""
@@ -162,7 +161,6 @@ class SampleTransform(KeepsCamera, nn.Module):
         if wrong := {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}:
             raise ValueError(f"{self._name}: fields must map names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
         self.options: Options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
-        self.antialias = antialias
         self.mask_fill: float = as_number(mask_fill, "mask_fill", self._name)
         self.valid_mask: bool = as_flag(valid_mask, "valid_mask", self._name)
 
@@ -173,20 +171,24 @@ class SampleTransform(KeepsCamera, nn.Module):
         super().__setattr__(name, value)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        if "antialias" in state:  # an attribute before 0.5
-            state["_warps_decide"] = state.pop("antialias") is None
+        if state.pop("antialias", False) is None or state.pop("_warps_decide", False):  # attributes before 0.5
+            state["options"]["antialias"] = None
         super().__setstate__(state)  # type: ignore[no-untyped-call]
         self._calls = Calls()  # which states before 0.5 lack
 
     @property
     def antialias(self) -> bool | None:
-        """The option of that name; None if each warp decides."""
-        return None if self._warps_decide else self.options["antialias"]
+        """The option of that name."""
+        return self.options["antialias"]
 
     @antialias.setter
     def antialias(self, value: bool | None) -> None:
-        self._warps_decide = value is None
-        self.options["antialias"] = value is not None and as_flag(value, "antialias", self._name)
+        self.options["antialias"] = None if value is None else as_flag(value, "antialias", self._name)
+
+    @property
+    def _warp_options(self) -> Any:
+        """The `options` of its warps; for those that do not choose by themselves what to antialias, None is False."""
+        return {**self.options, "antialias": bool(self.options["antialias"])}
 
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
         """Return the sample and the keyword arguments as one dict."""

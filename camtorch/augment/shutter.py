@@ -55,4 +55,4 @@ class RandomShutter(Augmentation):
     def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
         values = self._as_tensors(source, self._values_for(source, draw))
         shutter = RollingShutter(values["readout"], torch.deg2rad(values["rates"]), direction=self.direction)
-        return Part(source, ShutterWarp(source, source, target_shutter=shutter, **self.options))
+        return Part(source, ShutterWarp(source, source, target_shutter=shutter, **self._warp_options))

@@ -187,8 +187,7 @@ class CanonicalCamera(SampleTransform):
             sides = zip(size[::-1], (width, height), strict=True)
             left, top = ((new - 1) / 2 - (old - 1) / 2 * scale for new, old in sides)
             matrix = torch.stack((scale, zero, left, zero, scale, top), -1).unflatten(-1, (2, 3))
-            options = {**self.options, "antialias": self.antialias}
-            return Part(source, AffineWarp(source, edited(source, matrix, size), matrix, None, **options))
+            return Part(source, AffineWarp(source, edited(source, matrix, size), matrix, None, **self.options))
 
         return by_models(count, camera, part)
 

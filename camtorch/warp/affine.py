@@ -59,12 +59,9 @@ class UncheckedWarp(Warp):
     may_mirror = True
     map: Map | None = None
 
-    def __init__(
-        self, source: Camera, target: Camera, rotation: Tensor | None, *, antialias: bool | None = False, **options: Any
-    ):
-        super().__init__(source, target, None, antialias=bool(antialias), **options)
+    def __init__(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any):
+        super().__init__(source, target, None, **options)
         self.turned_by(rotation)
-        self._decides = antialias is None
         self._halvings: list[int] | None = None
 
     def warped(self, images: Tensor, sampler: Sampler, route: Route | None = None) -> Tensor:
@@ -72,7 +69,7 @@ class UncheckedWarp(Warp):
         smooth = sampler.mode != "nearest" and images.dtype != torch.bool
         called = torch.compiler.is_compiling() and not torch.onnx.is_in_onnx_export()
         if called and self._ways_need_values(smooth) and not keeps_graph(images, *self.tensors):
-            options = None if self._decides else self.antialias, sampler.padding_mode, sampler
+            options = self.antialias, sampler.padding_mode, sampler
             cameras = self.source, self.target, self.rotation
             matrix = None if self.map is None else as_tensor(self.map)
             return compiled.warped(images, *cameras, self.tolerance, *options, matrix, _edited)
@@ -99,11 +96,11 @@ class UncheckedWarp(Warp):
     def _ways_need_values(self, smooth: bool) -> bool:
         """Whether the ways depend on values, which are not known while code is traced."""
         mixed = self.source.is_mixed or self.target.is_mixed
-        return self._decides and smooth and self.moves_by_cameras and not mixed
+        return self.antialias is None and smooth and self.moves_by_cameras and not mixed
 
     def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[ImageEdit] | None:
         """Return the way of each row, or one for all; None to sample as any `Warp` does."""
-        if not (self._decides and smooth and route == "kept" and are_known(self.target.intrinsics)):
+        if not (self.antialias is None and smooth and route == "kept" and are_known(self.target.intrinsics)):
             return None
         if self._halvings is None:
             known = self.host or self  # the warp on the CPU, whose values need no wait
@@ -209,8 +206,8 @@ class AffineWarp(UncheckedWarp):
         return not self._numbers
 
     def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[ImageEdit] | None:
-        least: float = 1 if self.antialias else SHRINKS if self._decides else math.inf
-        least, decides = least if smooth else math.inf, smooth and self._decides and route == "kept"
+        least = {True: 1.0, None: SHRINKS, False: math.inf}[self.antialias] if smooth else math.inf
+        decides = smooth and self.antialias is None and route == "kept"
         sizes = self.source.size_for("Warp"), self.image_size
         return [_way(rows, *sizes, sampler.padding_mode, least, decides) for rows in self._numbers]
 

@@ -30,7 +30,7 @@ class Options(TypedDict):
     mode: Mode
     padding_mode: PaddingMode
     fill: tuple[float, ...]
-    antialias: bool
+    antialias: bool | None  # None: an `UncheckedWarp` chooses for each image, as other warps do not
     tolerance: float | None
 
 
@@ -65,7 +65,7 @@ def as_options(
         "mode": one_of(mode, MODES, "mode", owner),
         "padding_mode": one_of(padding_mode, PADDINGS, "padding_mode", owner),
         "fill": as_fill(fill, owner),
-        "antialias": antialias is not None and as_flag(antialias, "antialias", owner),
+        "antialias": None if antialias is None else as_flag(antialias, "antialias", owner),
         "tolerance": tolerance,
     }
 

@@ -109,7 +109,7 @@ class CameraPair(GeometryModule):
     source: Camera = _part("_modules", "source")
     target: Camera = _part("_modules", "target")
     rotation: Tensor | None = _part("_buffers", "rotation")
-    antialias: bool
+    antialias: bool | None
 
     def set_up(self, source: Camera, target: Camera, options: Options, batch: torch.Size | None = None) -> None:
         """Give a new warp its cameras and options, which are valid."""
@@ -220,7 +220,7 @@ class CameraPair(GeometryModule):
         """Return positions of some rows of the target, which serve a padding, within a tolerance."""
         source, target = self._ends
         sampled = with_seam(source, self.seam)
-        return locate(sampled, target, self.rotation, tolerance, self.antialias, rows, padding)
+        return locate(sampled, target, self.rotation, tolerance, bool(self.antialias), rows, padding)
 
     def move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         """Return pixels of the source on the target's image, or back, and whether there is one; see `moved_pixels`."""

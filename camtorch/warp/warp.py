@@ -82,12 +82,11 @@ class Warp(CameraPair):
         TypeError: If source or target is no Camera.
     """
 
-    _decides = False  # True: the warp itself chooses which images to antialias
     batch_shape: torch.Size
     mode: Mode
     padding_mode: PaddingMode
     fill: tuple[float, ...]
-    antialias: bool
+    antialias: bool | None
     _has_shutters: ClassVar[bool] = False
 
     def __init__(
@@ -322,7 +321,7 @@ class Warp(CameraPair):
             "mode": self.mode,
             "padding_mode": self.padding_mode,
             "fill": self.fill,
-            "antialias": None if self._decides else self.antialias,  # type: ignore[typeddict-item]
+            "antialias": self.antialias,
             "tolerance": self._tolerance,
         }
 
@@ -330,6 +329,8 @@ class Warp(CameraPair):
         lost = [name for name in ("shutter", "target_shutter") if state["_modules"].get(name) is not None]
         if lost and not self._has_shutters:
             raise ValueError(f"{type(self).__name__}: a saved warp must have no {lost[0]}; got one of 0.3. {LEFT}")
+        if state.pop("_decides", False):  # an attribute before 0.5
+            state["antialias"] = None
         super().__setstate__(state)
 
     def extra_repr(self) -> str:
