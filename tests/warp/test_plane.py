@@ -51,6 +51,22 @@ def test_of_pinholes_it_is_the_homography():
     torch.testing.assert_close(back, pixels[inside], rtol=0, atol=1e-6)
 
 
+def test_between_other_cameras_it_is_of_the_same_plane():
+    source, target = pinholes()
+    warp, pixels = ct.PlaneWarp(source, target, pose(), NORMAL, DISTANCE), target.pixel_grid()
+    moved = warp.between(wide((100, 120)), target, None, mode="nearest")
+    expected = ct.PlaneWarp(wide((100, 120)), target, pose(), NORMAL, DISTANCE)
+    assert (type(moved), moved.mode, moved.fill) == (ct.PlaneWarp, "nearest", (0.0,))
+    assert torch.equal(moved.move(pixels, back=True)[0], expected.move(pixels, back=True)[0])
+    eye = ct.BirdsEye(wide((100, 120)), above_ground(), x=(-2, 3), y=(0, 4), resolution=0.1)
+    pixels = torch.rand(9, 2, generator=torch.Generator().manual_seed(0)).double() * 100
+    both = (each.transform_points(pixels) for each in (eye, eye.between(eye.source, eye.target, None)))
+    for one, other in zip(*both, strict=True):
+        torch.testing.assert_close(one, other)
+    with pytest.raises(ValueError, match="PlaneWarp: rotation must be None"):
+        warp.between(source, target, torch.eye(3).double())
+
+
 def test_beyond_the_horizon_nothing_is_valid():
     source, target = wide((480, 640)), wide((60, 80))
     floor = ct.PlaneWarp(source, target, pose(), (0.0, 1.0, 0.0), 1.5)
