@@ -14,7 +14,7 @@ from camtorch.evaluate.tensors import known_false
 from camtorch.native.structs import FAR_ZOOM, HALVINGS, LOOKED_AT, MOST_ZOOM, NEARLY_FILLED, SPREAD, TURN_PARTS
 from camtorch.optics.radial_inverse import precise
 from camtorch.poses.rotations import rotation_matrix, rotation_vector
-from camtorch.values.arguments import broadcast_shapes, warn
+from camtorch.values.arguments import TOLD, broadcast_shapes, warn
 from camtorch.values.module import remade
 from camtorch.warp.boxes import along_edges
 from camtorch.warp.moving import moved_pixels
@@ -22,7 +22,6 @@ from camtorch.warp.moving import moved_pixels
 _ROOT = 1.324717957244746  # plastic number: a low-discrepancy sequence in 2D (R2)
 _CARE = 0.01  # largest error of the share that points measure
 _LESS = 0.9  # of the least field of view that was asked for: below that a warning says so
-_told: set[tuple[object, ...]] = set()  # what this process has warned of
 
 
 def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
@@ -139,8 +138,8 @@ def tell_of_narrow_images(
 
     target: returns the cameras that were zoomed by factors (*B,), and are filled to the parts `found` (*B,).
     """
-    key = owner, fov, share
-    if key in _told or not known_false(factor <= 1):
+    key = "less than fov", owner, fov, share
+    if key in TOLD or not known_false(factor <= 1):
         return
     zoomed = target()
     made = _across(zoomed).expand_as(factor)
@@ -149,7 +148,7 @@ def tell_of_narrow_images(
     less = (made < _LESS * least) & (factor > 1) & (found >= share)
     if not bool(less.any()):
         return
-    _told.add(key)
+    TOLD.add(key)
     warn(
         f"{owner}: fov must be {fov:g} degrees at least; got an image {float(made[less].min()):.0f} degrees "
         f"wide: min_filled={share:g} zooms until so much of it is filled, and the camera of the images, "

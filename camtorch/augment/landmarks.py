@@ -13,7 +13,7 @@ from torch import Tensor
 
 from camtorch.augment.change import gated
 from camtorch.augment.fields import Named
-from camtorch.values.arguments import as_flag, as_whole, one_of, shown, warn
+from camtorch.values.arguments import as_flag, as_whole, first_time, one_of, shown, warn
 
 
 def _order(count: int, *runs: tuple[int, int, int]) -> tuple[int, ...]:
@@ -115,7 +115,6 @@ def as_table(value: TableLike, owner: str) -> Table:
 
 # numbers of points that hardly anything else has
 _FACES = {n: " or ".join(repr(k) for k, v in LANDMARKS.items() if len(v) == n) for n in (68, 98, 106, 468, 478)}
-_told: set[int] = set()  # numbers of points that this process has warned about
 _PIXELS = "keypoints", "landmarks"  # kinds of fields that are landmarks
 _HOLD = *_PIXELS, "points"  # kinds of fields that may be landmarks
 _LEFT, _RIGHT = "_left", "_right"
@@ -155,8 +154,7 @@ class Mirroring:
         table = self._named.get(name.rpartition("/")[2]) if self._named is not None else self._one
         if table is None or count == 0:
             meant = _FACES.get(count) if self._named is None and kind in _PIXELS else None
-            if meant is not None and count not in _told:
-                _told.add(count)
+            if meant is not None and first_time(("landmarks", count)):
                 warn(
                     f"{self.owner}: {name} holds {count} points, and mirrored faces keep their order: point 0 is then "
                     f"on the other side. Pass landmarks={meant}, if that is their order, or "

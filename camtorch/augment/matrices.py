@@ -16,7 +16,7 @@ from camtorch.cameras.image_sizes import off_centre, warn_of_order, warn_of_size
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.tensors import known_false
 from camtorch.models import Pinhole
-from camtorch.values.arguments import check_degrees
+from camtorch.values.arguments import check_degrees, first_time
 from camtorch.values.dtypes import widen
 from camtorch.warp.views import pinhole
 
@@ -28,7 +28,6 @@ SHAPE = "(B, 3, 3) or (B, 4, 4), [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of the im
 SIDES = (3, 3), (4, 4)
 _SKEW = 1e-6  # parts of the focal length: a skew up to there is none
 _ALIKE = 1e-5  # relative: matrices that were float32 on the way are the same ones
-_told: set[str] = set()  # classes that have warned, in this process, of a matrix of another image
 _log = logging.getLogger(__name__)
 
 
@@ -56,19 +55,13 @@ class Guess(float):
 
 @functools.lru_cache(256)
 def _guessed(degrees: float, size: tuple[int, int]) -> Pinhole:
-    if not torch.compiler.is_compiling():
-        _tell()
+    if not torch.compiler.is_compiling() and first_time("cameras are guessed"):
+        _log.info(
+            "cameras are guessed: images without one are taken for those of a pinhole of the degrees given as camera=. "
+            "Positions in images move as they look; directions and poses are as right as the guess"
+        )
     with torch.inference_mode(False), torch.no_grad():  # it may be used in a graph later
         return Pinhole.from_fov(degrees, image_size=size).requires_grad_(False)
-
-
-@functools.lru_cache(1)
-def _tell() -> None:
-    """Note, once a process, that cameras are guessed."""
-    _log.info(
-        "cameras are guessed: images without one are taken for those of a pinhole of the degrees given as camera=. "
-        "Positions in images move as they look; directions and poses are as right as the guess"
-    )
 
 
 def matrix_hint(name: str, value: Tensor, batched: bool) -> str:
@@ -119,8 +112,7 @@ def pinhole_of_matrix(name: str, matrix: Tensor | list[Tensor], size: tuple[int,
             )
         check_matrix(row, name, owner)
     numbers = torch.stack([numbers_of(row) for row in rows]) if isinstance(matrix, list) else numbers_of(matrix)
-    if owner not in _told and (off := off_centre(numbers, size)):
-        _told.add(owner)
+    if (off := off_centre(numbers, size)) and first_time(("matrix of another image", owner)):
         warn_of_order(off, size, owner)
         warn_of_size(off, size, owner)
     return pinhole(numbers, size)

@@ -31,6 +31,7 @@ Result = TypeVar("Result")
 Name = TypeVar("Name", bound=str)
 
 CLOSE = 0.5  # as difflib has it: size and image_size are
+TOLD: set[object] = set()  # keys of what this process has told its user; see `first_time`
 
 
 def present(value: Result | None, what: str) -> Result:
@@ -69,6 +70,14 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_INSIDE):
         level, frame = level + 1, frame.f_back
     warnings.warn(text, category, stacklevel=level)
+
+
+def first_time(key: object) -> bool:
+    """Whether this process has not been here with a key before, to warn of something once."""
+    if key in TOLD:
+        return False
+    TOLD.add(key)
+    return True
 
 
 def imported(module: str, needs: str, extra: str, has: str = "__name__") -> Any:

@@ -12,6 +12,7 @@ from cameras import slow_unless
 import camtorch as ct
 import camtorch.augment.numpy
 from camtorch.poses import rotations
+from camtorch.values.arguments import TOLD
 from camtorch.warp import samples, sampling
 
 A = ct.augment
@@ -434,13 +435,13 @@ def test_landmarks_by_field_and_by_pairs():
 
 
 @pytest.mark.parametrize(("count", "name"), [(98, "wflw98"), (468, "mediapipe468"), (478, "mediapipe478")])
-def test_a_mirrored_face_without_a_table_is_told_once(count, name, monkeypatch):
-    monkeypatch.setattr("camtorch.augment.landmarks._told", set())
+def test_a_mirrored_face_without_a_table_is_told_once(count, name):
+    TOLD.clear()
     sample = {"image": torch.zeros(1, *SIZE), "keypoints": torch.rand(2, count, 2) * 40}
     with pytest.warns(UserWarning, match=f"keypoints holds {count} points, .* landmarks='{name}'") as told:
         [A.HorizontalFlip(p=1.0)(sample), A.VerticalFlip(p=1.0)(sample)]
     assert len(told) == 1
-    monkeypatch.setattr("camtorch.augment.landmarks._told", set())
+    TOLD.clear()
     kept = A.HorizontalFlip(p=1.0, landmarks={})(sample)["keypoints"]
     assert torch.equal(kept[..., 1], sample["keypoints"][..., 1])
 

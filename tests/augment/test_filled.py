@@ -8,6 +8,7 @@ import torch
 import camtorch as ct
 import camtorch.augment.kornia
 from camtorch.augment import PRESETS, RandomCamera, RandomLens, RandomMount
+from camtorch.values.arguments import TOLD
 
 SIZE = (120, 160)
 
@@ -24,8 +25,8 @@ def shares(augmentation, count=24, seed=0, **fields):
 
 
 @pytest.fixture
-def untold(monkeypatch):
-    monkeypatch.setattr("camtorch.augment.filling._told", set())
+def untold():
+    TOLD.clear()
 
 
 def test_mostly_empty_images_are_told_once_with_the_number():

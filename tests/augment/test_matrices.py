@@ -14,6 +14,7 @@ from torchvision_stand_in import torchvision_of
 import camtorch as ct
 import camtorch.augment.numpy
 from camtorch.augment import matrices
+from camtorch.values.arguments import TOLD
 
 A, SIZE = ct.augment, (96, 128)
 K = torch.tensor([[120.0, 0, 61], [0, 124, 46], [0, 0, 1]])
@@ -220,8 +221,8 @@ def test_what_is_no_matrix_is_refused(value, message):
 
 
 @pytest.mark.parametrize(("scale", "message"), [(2, "of images of about"), (1 / 128, "parts of")])
-def test_a_matrix_of_another_image_warns_once(scale, message, monkeypatch):
-    monkeypatch.setattr(matrices, "_told", set())
+def test_a_matrix_of_another_image_warns_once(scale, message):
+    TOLD.clear()
     matrix = K * torch.tensor([scale, scale, 1.0])[:, None]
     with pytest.warns(UserWarning, match=f"Resize: .*{message}"):
         A.Resize(20)(image=torch.rand(3, *SIZE), K=matrix)
@@ -270,7 +271,7 @@ def test_a_number_takes_the_place_of_a_camera():
 
 
 def test_a_guess_is_told_once(caplog):
-    matrices._tell.cache_clear()
+    TOLD.clear()
     matrices._guessed.cache_clear()
     with caplog.at_level(logging.INFO, logger="camtorch"):
         for size in (SIZE, (50, 60)):

@@ -16,6 +16,7 @@ from torch import nn
 import camtorch as ct
 import camtorch.augment.kornia
 import camtorch.augment.numpy
+from camtorch.values.arguments import TOLD
 
 A = ct.augment
 SIZE = (48, 64)
@@ -341,13 +342,12 @@ FORMS = {
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("name", WARNINGS)
-def test_a_first_sample_of_any_form_warns_once(name, form, monkeypatch):
+def test_a_first_sample_of_any_form_warns_once(name, form):
     where, make, more = WARNINGS[name]
     image = torch.zeros(*SIZE, 3) if form == "numpy" else torch.zeros(3, *SIZE)
     fields = FORMS[form]({"image": image, **more})
     for is_error in (True, False):
-        monkeypatch.setattr("camtorch.augment.filling._told", set())
-        monkeypatch.setattr("camtorch.augment.landmarks._told", set())
+        TOLD.clear()
         augment = make(20) if make is A.Resize else make()
         augment.camera = STRIP if name == "min_filled" else camera()
         call = camtorch.augment.numpy.Transform(augment) if form == "numpy" else augment
