@@ -74,8 +74,8 @@ class Augmentation(SampleTransform):
         min_filled: the part of every new image, from 0 to 1, that has to show something of the old one. As far as it
             takes, the new camera zooms, and where four times are not enough it turns less far. This follows from the
             camera and the draw, and so does a replay. A warning tells once if a source cannot fill so much. None
-            leaves images as they are drawn, and warns once where more than a third of what the old ones show is going
-            to be empty; so does 0, without a word.
+            and 0 leave images as they are drawn; None warns once if more than a third of what the old ones show is
+            going to be empty.
 
     Raises:
         ValueError: a p or a min_filled outside of [0, 1], an unknown kind of field or way to sample.
@@ -94,7 +94,7 @@ class Augmentation(SampleTransform):
     place: bool = False
     """Whether `crop_place` comes out; see `BoxCrop`."""
     crops: Mapping[str, int] = MappingProxyType({})
-    """The boxes of a sample that a draw needs: name in the draw -> index among the boxes."""
+    """Maps a name in draws, such as "box", to the index of the box of the sample that it holds."""
     p: float
     same_on_batch: bool
     min_filled: float | None
@@ -190,11 +190,11 @@ class Augmentation(SampleTransform):
 
     def change(self, camera: Camera | Sequence[Camera] | None, draw: Mapping[str, Tensor]) -> Change:
         """Return the change that a draw makes to images of `camera` (None: the augmentation's own)."""
-        own = self.camera if camera is None else camera
-        if own is None or isinstance(own, (int, float)):
+        before = self.camera if camera is None else camera
+        if before is None or isinstance(before, (int, float)):
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
-            raise ValueError(f"{self._name}: camera must be given; got {own}. Please {how}. {GUESS_CAMERA}")
-        return self._change_where_drawn(one_or_batch(own), self._as_numbers(draw))
+            raise ValueError(f"{self._name}: camera must be given; got {before}. Please {how}. {GUESS_CAMERA}")
+        return self._change_where_drawn(one_or_batch(before), self._as_numbers(draw))
 
     def _change_where_drawn(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         """Return the change of a draw, computed where the draw is: on the CPU also for fixed cameras elsewhere."""
@@ -247,10 +247,7 @@ class Augmentation(SampleTransform):
         return Change(count, parts, keeps_mixed=isinstance(camera, Mixed))
 
     def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
-        """Return what parts of a `Compose` must do that this one, before `later` parts, does not; None if all is well.
-
-        name: what the text calls this part.
-        """
+        """Return what parts of a `Compose` must do if this one, called `name`, cannot precede `later` ones; or None."""
         colours = self.beside_the_camera.intersection(self.ranges)
         if colours and any(part.needs_camera and not part.keeps_lens for part in later):
             return f"be edits after {' and '.join(sorted(colours))}, which another lens would show"
@@ -292,7 +289,10 @@ class Augmentation(SampleTransform):
         return Part(source, Warp(source, target, rotation, **self._warp_options))
 
     def _values_for(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
-        """Return drawn values, (*B,) or (*B, size); without *B if all are alike, so that one map serves all samples."""
+        """Return drawn values, (*B,) or (*B, size).
+
+        If one camera serves all samples and all draws are equal, the dim *B is left out: one warp serves all.
+        """
         if isinstance(draw["apply"], list):  # of one sample
             values = dict(zip(draw, map(_first, draw.values()), strict=True))  # without a loop of Python
             del values["apply"]
@@ -338,8 +338,8 @@ class Augmentation(SampleTransform):
             first = camera.detach()
             first = first[[0] * _TRIES] if first.batch_shape else first
             shares = filled(first, *self._new_camera(first, self._values_for(first, values)))
-            own = filled(first, first, None)  # less than 1 if a fisheye shows a circle
-        if shares.mean() < _FEW * own.mean():
+            most = filled(first, first, None)  # less than 1 if a fisheye shows a circle
+        if shares.mean() < _FEW * most.mean():
             warn(
                 f"{self._name}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
                 f"{1 - float(shares.min()):.0%}, as the camera of the images does not see so far. min_filled=0.9 zooms "

@@ -191,7 +191,7 @@ class Compose(Augmentation):
 
 def _by_place(parts: Iterable[Mapping[str, T]]) -> Mapping[str, T]:
     """Return what parts have by name as one mapping, by the index of the part and the name, as "0.yaw"."""
-    return MappingProxyType({f"{i}.{key}": value for i, own in enumerate(parts) for key, value in own.items()})
+    return MappingProxyType({f"{i}.{name}": value for i, part in enumerate(parts) for name, value in part.items()})
 
 
 def _moved(change: Change, boxes: Any, camera: Camera) -> Tensor:

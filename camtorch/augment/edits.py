@@ -118,10 +118,10 @@ def _turn(matrix: Map, source: Camera) -> Tensor | None:
     """Return the effect (*B, 3, 3) of an edit on rays; None if it leaves them unchanged."""
     if not isinstance(matrix, Tensor) and matrix[0][0] > 0 and matrix[1][1] > 0:
         return None
-    own, like = as_tensor(matrix), source.intrinsics
-    if known_true(own[..., :2].diagonal(dim1=-2, dim2=-1) > 0):
+    factors, like = as_tensor(matrix)[..., :2], source.intrinsics
+    if known_true(factors.diagonal(dim1=-2, dim2=-1) > 0):
         return None
-    signs = own[..., :2].sign()  # of a mirror, or a turn about the axis
+    signs = factors.sign()  # of a mirror, or a turn about the axis
     rotation = F.pad(signs, (0, 1, 0, 1)) + signs.new_tensor([0.0, 0.0, 1.0]).diag()
     return rotation.to(like.device, torch.promote_types(like.dtype, torch.float32))
 

@@ -32,7 +32,8 @@ def _meant(transform: Any, word: str) -> str:
     known = [*_keywords(transform)]
     close = difflib.get_close_matches(word, [*known, *transform.other_words], 1, CLOSE)
     meant = f"did you mean {transform.other_words.get(close[0], close[0])!r}? Known" if close else "known"
-    kin = (one for base in transform.__mro__[1:-2] for one in (base, *base.__subclasses__()))
+    _, *bases, _module, _object = transform.__mro__
+    kin = (one for base in bases for one in (base, *base.__subclasses__()))
     has = next((one.__name__ for one in kin if word in _keywords(one)), None)
     return f"{meant} are {', '.join(known)}" + (f". {has} has it" if has else "")
 
@@ -43,13 +44,13 @@ def _keywords(transform: Any) -> dict[str, None]:
     names: dict[str, None] = {}
     for owner in transform.__mro__:
         if "__init__" in vars(owner):
-            own, hints = vars(owner)["__init__"], {}
-            _, *parameters = inspect.signature(own).parameters.values()
+            init, hints = vars(owner)["__init__"], {}
+            _, *parameters = inspect.signature(init).parameters.values()
             names |= dict.fromkeys(p.name for p in parameters if p.kind is not p.VAR_KEYWORD)
             if not parameters or (rest := parameters[-1].name) in names:
                 break
             with contextlib.suppress(NameError):  # of what is imported for checkers alone
-                hints = get_type_hints(own)
+                hints = get_type_hints(init)
             if get_origin(hints.get(rest)) is Unpack:
                 return names | dict.fromkeys(get_type_hints(get_args(hints[rest])[0]))
     return names

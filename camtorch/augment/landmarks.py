@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -115,8 +115,8 @@ def as_table(value: TableLike, owner: str) -> Table:
 
 # numbers of points that hardly anything else has
 _FACES = {n: " or ".join(repr(k) for k, v in LANDMARKS.items() if len(v) == n) for n in (68, 98, 106, 468, 478)}
-_PIXELS = "keypoints", "landmarks"  # kinds of fields that are landmarks
-_HOLD = *_PIXELS, "points"  # kinds of fields that may be landmarks
+_SURELY_LANDMARKS = "keypoints", "landmarks"  # kinds of fields
+_MAYBE_LANDMARKS = *_SURELY_LANDMARKS, "points"
 _LEFT, _RIGHT = "_left", "_right"
 
 
@@ -153,7 +153,7 @@ class Mirroring:
         """
         table = self._named.get(name.rpartition("/")[2]) if self._named is not None else self._one
         if table is None or count == 0:
-            meant = _FACES.get(count) if self._named is None and kind in _PIXELS else None
+            meant = _FACES.get(count) if self._named is None and kind in _SURELY_LANDMARKS else None
             if meant is not None and first_time(("landmarks", count)):
                 warn(
                     f"{self.owner}: {name} holds {count} points, and mirrored faces keep their order: point 0 is then "
@@ -161,16 +161,15 @@ class Mirroring:
                     "landmarks={} to keep it"
                 )
             return None
-        order, exact = table.order, table.exact
-        own = len(order)
-        if count == own or (count > own and not exact):
-            return order + tuple(range(own, count))
+        size = len(table.order)
+        if count == size or (count > size and not table.exact):
+            return table.order + tuple(range(size, count))
         if kind != "points" or self._named is not None:  # 3D points may be no landmarks
             others = [known for known, its in LANDMARKS.items() if len(its) == count]
             hint = f"landmarks={{{name!r}: {repr(others[0]) if others else '[(left, right), ...]'}}} gives it by field"
-            if not others and count % own == 0:
-                hint = f"Several faces go in as (B, F, {own}, 2): {name}.unflatten(-2, (-1, {own}))"
-            raise ValueError(f"{self.owner}: {name} must have {own} points, as landmarks has; got {count}. {hint}")
+            if not others and count % size == 0:
+                hint = f"Several faces go in as (B, F, {size}, 2): {name}.unflatten(-2, (-1, {size}))"
+            raise ValueError(f"{self.owner}: {name} must have {size} points, as landmarks has; got {count}. {hint}")
         return None
 
     def swapped(
@@ -181,7 +180,7 @@ class Mirroring:
             raise ValueError(
                 f"{self.owner}: {name} must be (B, N, ...), as it has a table of landmarks; got {shown(value)}"
             )
-        if (kind is not None and kind not in _HOLD) or value.ndim < (2 if flags else 3) or not value.numel():
+        if (kind is not None and kind not in _MAYBE_LANDMARKS) or value.ndim < (2 if flags else 3) or not value.numel():
             return value  # an image without faces may come with another number of points
         axis = value.ndim - (1 if flags else 2)
         axis -= axis > 1 and value.shape[axis] == 1  # OpenCV's (B, N, 1, 2)
@@ -212,41 +211,46 @@ class Mirroring:
         return found
 
     def exchange(self, moved: dict[str, Any], named: Named, mirrored: Tensor | None, batched: bool, owner: str) -> None:
-        """Let landmarks and fields of a moved sample change places where they are seen in a mirror, (B,) bool."""
+        """Let landmarks and fields of a moved sample change places where they are seen in a mirror, (B,) bool.
+
+        named: the fields that move. Others may have a table of landmarks too, such as the visibility of each one.
+        """
         sides = self.sides(named)  # raises if a side lacks the other one, whether or not this draw mirrors
-        others = (name for name in moved if name.rpartition("/")[2] in self.by_name and name not in named)
-        kept = {name: (None, moved[name]) for name in others}
-        for name, (_, value) in kept.items():  # values of each landmark that do not move, such as visibilities
-            several = isinstance(value, (list, tuple)) and all(isinstance(v, (Tensor, np.ndarray)) for v in value)
-            if not several and not isinstance(value, (Tensor, np.ndarray)):
-                raise TypeError(
-                    f"{owner}: {name} has a table of landmarks, and must be a tensor of (B, N, ...); got "
-                    f"{type(value).__name__}"
-                )
-            moved[name] = [torch.as_tensor(v) for v in value] if several else torch.as_tensor(value)
-        pixels = [one for kind, value in named.values() for one in _items(value) if kind in _PIXELS]
+        kinds: dict[str, str | None] = {name: kind for name, (kind, _) in named.items()}
+        for name in [name for name in moved if name.rpartition("/")[2] in self.by_name and name not in named]:
+            kinds[name], moved[name] = None, _as_tensors(moved[name], name, owner)
+        pixels = [one for kind, value in named.values() if kind in _SURELY_LANDMARKS for one in _batches(value)]
         faces = {tuple(one.shape[1:3]) for one in pixels if one.ndim == 4}  # (F, N)
-        keys = {key for name in (*named, *kept) for key in (name, f"{name}_valid") if key in moved}
-        single = {key for key in keys if not (batched or isinstance(moved[key], list))}
+        # key -> its field, and whether each landmark has a flag, or one number, instead of a dim of coordinates
+        pairs = [(name, key) for name in kinds for key in (name, f"{name}_valid") if key in moved]
+        keys = {key: (name, kinds[name] is None or key != name) for name, key in pairs}
+        single = [key for key in keys if not (batched or isinstance(moved[key], list))]
         moved |= {key: moved[key][None] for key in single}
-        for name, (found, _) in {**named, **kept}.items():
-            for key, flags in ((name, found is None), (f"{name}_valid", True)):
-                if key not in keys:
-                    continue
-                items = _items(moved[key])
-                rows = torch.zeros(sum(map(len, items)), dtype=torch.bool) if mirrored is None else mirrored
-                each = rows.split(1) if isinstance(moved[key], list) else [rows]
-                pairs = zip(items, each, strict=False)
-                swapped = [self.swapped(name, found, value, row, flags, faces) for value, row in pairs]
-                moved[key] = [v[0] for v in swapped] if isinstance(moved[key], list) else swapped[0]
-        for left, right in sides if mirrored is not None else ():
-            for one, other in ((left, right), (f"{left}_valid", f"{right}_valid")):
-                if one in keys and other in keys:
-                    moved[one], moved[other] = exchanged(moved[one], moved[other], cast("Tensor", mirrored))
+        for key, (name, flags) in keys.items():
+            value = moved[key]
+            rows = torch.zeros(len(value), dtype=torch.bool) if mirrored is None else mirrored
+            each = zip(_batches(value), rows.split(1) if isinstance(value, list) else [rows], strict=False)
+            swapped = [self.swapped(name, kinds[name], batch, row, flags, faces) for batch, row in each]
+            moved[key] = [batch[0] for batch in swapped] if isinstance(value, list) else swapped[0]
+        if mirrored is not None:
+            for left, right in [(f"{left}{end}", f"{right}{end}") for left, right in sides for end in ("", "_valid")]:
+                if left in keys and right in keys:
+                    moved[left], moved[right] = exchanged(moved[left], moved[right], mirrored)
         moved |= {key: moved[key][0] for key in single}
 
 
-def _items(value: Any) -> list[Tensor]:
+def _as_tensors(value: Any, name: str, owner: str) -> Tensor | list[Tensor]:
+    """Return the values of landmarks that do not move as a tensor, or as one for each sample of a list."""
+    if isinstance(value, (list, tuple)) and all(isinstance(one, (Tensor, np.ndarray)) for one in value):
+        return [torch.as_tensor(one) for one in value]
+    if not isinstance(value, (Tensor, np.ndarray)):
+        raise TypeError(
+            f"{owner}: {name} has a table of landmarks, and must be a tensor of (B, N, ...); got {type(value).__name__}"
+        )
+    return torch.as_tensor(value)
+
+
+def _batches(value: Any) -> list[Tensor]:
     """Return a list of tensors as batches of one, a batch as the only one."""
     return [one[None] for one in value] if isinstance(value, list) else [value]
 
