@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.change import Change, LazyWarp, Part
-from camtorch.augment.fields import KINDS, field_of
+from camtorch.augment.fields import KINDS, Named, field_of
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_free, are_numbers, known_true
@@ -22,16 +23,19 @@ from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import thread_count
 from camtorch.warp.boxes import along_edges, around, corners_of, in_order
 from camtorch.warp.options import Options, Sampler
-from camtorch.warp.samples import Label, MovedField, call_for, natives_of
+from camtorch.warp.samples import Label, MovedField, SampleCall, Sizes, call_for, natives_of
 
-_OUTLINES = "pixels", "boxes"
+_MIRRORED: Sequence[Label] = "boxes", "rays"
+"""Labels of a single sample that one call of C moves beside pixels, also in a mirror."""
+_TURNED: Sequence[Label] = *_MIRRORED, "columns", "pose", "rotation vectors"
+"""Those that it moves where nothing is mirrored."""
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
 
 
 def form_of(
     sample: Mapping[str, Any], camera: object, fields: Mapping[str, str], revision: object
 ) -> tuple[Any, ...] | None:
-    """Return all that a plan depends on; None if a plan cannot be kept.
+    """Return all that a plan depends on, by which it is kept; None if it cannot be kept.
 
     A plan cannot be kept if the camera is a `Mixed`, tensors are traced, or a field is, for example, a list.
 
@@ -39,21 +43,24 @@ def form_of(
     """
     if not isinstance(camera, Camera) or camera.is_mixed:
         return None
-    is_free = are_free(*[value for value in sample.values() if isinstance(value, Tensor)])
+    tensors: list[Tensor] = []
+    values: list[Any] = []
+    for name, value in sample.items():
+        if isinstance(value, Tensor):
+            tensors.append(value)
+            values += name, type(value), value.shape, value.stride(), value.dtype, value.device
+        elif value is None or isinstance(value, (str, int, float, Camera)):
+            values += name, type(value)
+        else:
+            return None
+    is_free = are_free(*tensors)
     if not is_free and not are_free():
         return None
     intrinsics, distortion = camera.intrinsics, camera.distortion
+    numbers = intrinsics.shape, intrinsics.dtype, intrinsics.device, distortion.shape
     # each thread has calls of its own
-    parts: list[Any] = [revision, get_ident(), type(sample), type(camera), camera.image_size]
-    parts += intrinsics.shape, intrinsics.dtype, intrinsics.device, distortion.shape
-    for name, value in sample.items():
-        if isinstance(value, Tensor):
-            parts += name, type(value), value.shape, value.stride(), value.dtype, value.device
-        elif value is None or isinstance(value, (str, int, float, Camera)):
-            parts += name, type(value)
-        else:
-            return None
-    return *parts, is_free, *fields.items()
+    state = revision, get_ident(), is_free
+    return *state, type(camera), camera.image_size, *numbers, type(sample), *values, *fields.items()
 
 
 @dataclass(frozen=True)
@@ -65,10 +72,8 @@ class SamplePlan:
     count: int
     masks: Sequence[str]  # names of the masks of validity that come out: "image_valid" and so on
     mask_fill: float
-    calls: Kept | None  # the names of the fields that one call of C moves, and the call; None if a graph may want them
-    is_cpu: bool  # whether they lie there
-    of_one: bool  # whether cameras are a batch of one, which serves all samples
-    has_matrices: bool  # whether some field is a camera matrix
+    calls: Kept | None
+    """Maps settings to the names of the fields that one call of C moves, and the call; None if autograd may record."""
 
     def rows(self, value: Any) -> Any:
         """Return a value with a dim B; a list has one already."""
@@ -88,52 +93,76 @@ class SamplePlan:
             return self._pixels_at_once(part, values)
         source: Native | None
         target: Native | None
-        options, turns, is_turn = moves.options, None, False
+        labels: Sequence[Label] = ()
         if isinstance(moves, LazyWarp):
             source, target, rotation, size = moves.source_native, moves.target_native, moves.rotation, moves.image_size
+            if self.count == 1:
+                labels = _TURNED if moves.is_turn else _MIRRORED
         elif part.shades or part.light is not None or (natives := natives_of(moves)) is None:
             return {}
         else:
             (source, target, rotation), size = natives, moves.target.size_for("Warp")
         if source is None or target is None:
             return {}
-        if self.count == 1 and isinstance(moves, LazyWarp):
-            turns, is_turn = source.dtype, moves.is_turn
-        elif max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != self.count:
+        if max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != self.count:
             return {}
         sizes = part.camera.size_for("Warp"), size
-        settings = sizes, source.dtype, turns, is_turn, thread_count(), *options.values()
+        settings = sizes, source.dtype, labels, thread_count(), *moves.options.values()
         if (known := calls.entry((), settings)) is None:
-            ways = self._ways(values, options, turns, is_turn)
-            chosen = [values[name] for name in ways]
-            call = call_for(sizes, source.dtype, options, chosen, [*ways.values()], self.batched) if ways else None
-            others = [n for n, how in ways.items() if how in _OUTLINES and values[n].dtype != source.dtype]
-            names, others, call = calls((), settings, lambda: ([*ways], others, call))
+            new = functools.partial(self._new_call, values, sizes, source.dtype, moves.options, labels)
+            names, call = calls((), settings, new)
         else:
-            names, others, call = known[2]
+            names, call = known.result
         if call is None or (moved := call(source, target, rotation, [*map(values.__getitem__, names)])) is None:
             return {}
-        results: dict[str, Any] = dict(zip(names, moved, strict=True))
-        if None in moved:
-            results = {name: result for name, result in results.items() if result is not None}
-        for name in others:  # which were computed in the dtype of the cameras
-            if name in results:
-                rows, valid = results[name]
-                results[name] = _in_range(rows, values[name].dtype), valid
+        results = dict[str, MovedField]()
+        for name, result in zip(names, moved, strict=True):
+            if result is not None:
+                rows, valid = result  # pixels and boxes are computed in the dtype of the cameras
+                results[name] = _in_range(rows, dtype) if (dtype := values[name].dtype) != rows.dtype else rows, valid
         return results
 
+    def _new_call(
+        self,
+        values: Mapping[str, Any],
+        sizes: Sizes,
+        dtype: torch.dtype,
+        options: Options,
+        labels: Sequence[Label],
+    ) -> tuple[Sequence[str], SampleCall | None]:
+        """Return the names of the fields that one call of C moves, and the call; None if no call serves.
+
+        sizes, dtype, options: as of `call_for`. labels: those that it moves beside pixels.
+        """
+        hows: dict[str, Sampler | Label] = {}
+        for name, kind in self.fields.items():
+            value = values[name]
+            if isinstance(value, list) or (how := field_of(kind, value).by_c) == "never":
+                return [], None
+            if how is None or value.ndim - self.batched > KINDS[kind].most_dims:  # of frames
+                continue
+            if callable(how):
+                sampler = how(options, self.mask_fill)
+                hows |= {name: sampler} if len(sampler.fill) == 1 or len(sampler.fill) == value.shape[-3] else {}
+            elif how == "pixels":
+                hows |= {name: how} if self.count == 1 or value.numel() < _MANY_PIXELS else {}
+            elif how in labels and value.dtype == dtype and are_numbers(value):
+                hows |= {name: how} if how == "boxes" or value.is_contiguous() else {}
+        chosen = [values[name] for name in hows]
+        return [*hows], call_for(sizes, dtype, options, chosen, [*hows.values()], self.batched) if hows else None
+
     def _pixels_at_once(self, part: Part, values: Mapping[str, Any]) -> dict[str, MovedField]:
-        """Move pixels and boxes by one evaluation of the cameras, of which torch makes hundreds of operations."""
+        """Move all pixels and boxes by one evaluation of the cameras: in torch each takes hundreds of operations."""
         warp, dtype = part.warp, part.camera.intrinsics.dtype
         given, outlines = dict[str, Tensor](), list[Tensor]()
         for name, kind in self.fields.items():
             value = values[name]
             if isinstance(value, list) or value.dtype != dtype or value.ndim - self.batched > KINDS[kind].most_dims:
                 continue
-            way = field_of(kind, value).by_c
-            if way == "pixels" or (way == "boxes" and known_true(in_order(value).all())):
+            how = field_of(kind, value).by_c
+            if how == "pixels" or (how == "boxes" and known_true(in_order(value).all())):
                 given[name] = rows = self.rows(value)
-                outlines.append(rows if way == "pixels" else along_edges(corners_of(rows), EDGE_POINTS))
+                outlines.append(rows if how == "pixels" else along_edges(corners_of(rows), EDGE_POINTS))
         if len(given) < 2 or not warp.moves_by_cameras:  # others move points by more than their cameras
             return {}
         moved, mapped = warp.move(torch.cat([outline.flatten(1, -2) for outline in outlines], 1))
@@ -148,32 +177,6 @@ class SamplePlan:
             results[name] = (places, seen) if self.batched else (places.squeeze(0), seen.squeeze(0))
         return results
 
-    def _ways(
-        self, values: Mapping[str, Any], options: Options, turns: torch.dtype | None, is_turn: bool
-    ) -> dict[str, Sampler | Label]:
-        """Return how each field moves that one call of C takes.
-
-        turns: the dtype in which labels of a single sample turn; None if they do not turn by the call. is_turn: whether
-        the rotation does not mirror.
-        """
-        ways: dict[str, Sampler | Label] = {}
-        for name, kind in self.fields.items():
-            value = values[name]
-            if isinstance(value, list) or (way := field_of(kind, value).by_c) == "never":
-                return {}
-            if value.ndim - self.batched > KINDS[kind].most_dims:  # frames
-                continue
-            if callable(way):
-                sampler = way(options, self.mask_fill)
-                ways |= {name: sampler} if len(sampler.fill) == 1 or len(sampler.fill) == value.shape[-3] else {}
-            elif way == "pixels":
-                ways |= {name: way} if self.count == 1 or value.numel() < _MANY_PIXELS else {}
-            elif way is None or value.dtype != turns or not are_numbers(value):
-                continue
-            elif way == "boxes" or (value.is_contiguous() and (way == "rays" or is_turn)):
-                ways[name] = way
-        return ways
-
 
 class Batch(NamedTuple):
     """Samples as they move: their plan, the values of its fields, and their cameras."""
@@ -181,11 +184,23 @@ class Batch(NamedTuple):
     plan: SamplePlan
     values: Mapping[str, Any]  # as they came, where these are tensors; without a dim B if the plan is not `batched`
     camera: Camera
-    checked: bool  # True: values were checked, or may be bad; False: their form is known, and `_moved` checks them
+    must_check: bool  # whether values are to be checked as they move: they were not, and come from no network
 
-    def rows(self) -> dict[str, tuple[str, Any]]:
+    def rows(self) -> Named:
         """Return name -> kind and value, with a dim B."""
         return {name: (kind, self.plan.rows(self.values[name])) for name, kind in self.plan.fields.items()}
+
+    def moved(self, name: str, change: Change, options: Mapping[str, float], owner: str) -> tuple[Any, Any]:
+        """Return a field after a change, with a dim B or as a list if it came so, and which of it is valid, if any."""
+        kind, value, batched = self.plan.fields[name], self.values[name], self.plan.batched
+        if isinstance(value, list):
+            pairs = [move(change.row(i), kind, v.unsqueeze(0), options) for i, v in enumerate(value)]
+            flags = [valid.squeeze(0) for _, valid in pairs if valid is not None]
+            return [rows.squeeze(0) for rows, _ in pairs], flags or None
+        if self.must_check:
+            KINDS[kind].check(value, name, owner)
+        rows, valid = move(change, kind, value if batched else value.unsqueeze(0), options)
+        return (rows, valid) if batched else (rows.squeeze(0), None if valid is None else valid.squeeze(0))
 
 
 def move(change: Change, kind: str, value: Tensor, options: Mapping[str, float]) -> MovedField:

@@ -48,7 +48,7 @@ def check_fields(
     """Raise if the shape or the values of a field are wrong; return the number of samples.
 
     has_frames: whether values of a single sample may have leading dims. mode: how images are sampled; None if values
-    may be bad, as predictions are.
+    come from a network, and are not checked.
     """
     images = [value for kind, value in named.values() if kind == "image"]
     size = images[0][0].shape[-2:] if images and len(images[0]) else ()
@@ -69,10 +69,10 @@ def check_fields(
                 if several and flags is not None:
                     flags = flags[i] if i < len(flags) else ()
                 warn_of_numbers(kind, which, item, flags, size, owner)
-        own = len(value) if batched or several else 1
-        count = own if count < 0 else count
-        if own != count:
-            raise ValueError(f"{owner}: {name} must be of {count} samples, as other fields; got {own}")
+        rows = len(value) if batched or several else 1
+        count = rows if count < 0 else count
+        if rows != count:
+            raise ValueError(f"{owner}: {name} must be of {count} samples, as other fields; got {rows}")
     return count
 
 

@@ -39,11 +39,11 @@ Sample = dict[str, Any]
 
 
 class Single(dict[str, Any]):
-    """A sample that is known to be a single one, without batch dims."""
+    """A sample that is known to have no dim B, whatever the dims of its fields; other dicts are asked for theirs."""
 
 
 class Frames(Single):
-    """A single sample whose values may have leading dims, as those of clips have: all of them move by one change."""
+    """A single sample whose fields may have leading dims, as those of frames: one change moves all of them."""
 
 
 class KeepsCamera:
@@ -78,7 +78,7 @@ class Calls:
     warned: bool = False
 
     def __init__(self) -> None:
-        self.revision = object()  # another one whenever a public attribute is set: results are kept by it
+        self.revision = object()  # key of kept plans; replaced whenever a public attribute is set
         self.plans = Kept(16)  # of the last forms of samples
 
     def __reduce__(self) -> tuple[type[Calls], tuple[()]]:
@@ -191,11 +191,12 @@ class SampleTransform(KeepsCamera, nn.Module):
         return {**self.options, "antialias": bool(self.options["antialias"])}
 
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
-        """Return the sample and the keyword arguments as one dict."""
+        """Return the sample and the keyword arguments as one new dict, which is a `Single` if the sample is."""
         if not (sample is None or hasattr(sample, "keys")):
             must = f"a sample must be a dict of fields, or keywords, as in image=...; got {type(sample).__name__}"
             raise TypeError(f"{self._name}: {must}. {FRONT_ENDS}")
-        return sample if isinstance(sample, Single) and not fields else {**({} if sample is None else sample), **fields}
+        kind = type(sample) if isinstance(sample, Single) else dict
+        return kind({} if sample is None else sample, **fields)
 
     def _clips(self, sample: Sample, kinds: Mapping[str, str] | None = None) -> Clips | None:
         """Return the clips of a sample, if an image has the dims (B, T, C, H, W)."""
@@ -211,7 +212,8 @@ class SampleTransform(KeepsCamera, nn.Module):
     ) -> Batch:
         """Return what moves of a sample; the plan of its form is kept.
 
-        camera: instead of the sample's. predicted: values may be bad. kinds: name -> kind, in addition to `fields`.
+        camera: instead of the sample's. predicted: values come from a network, and are not checked.
+        kinds: name -> kind, in addition to `fields`.
         """
         camera = sample.get("camera") if camera is None else camera
         fields = {**self.fields, **kinds} if kinds else self.fields
@@ -222,14 +224,15 @@ class SampleTransform(KeepsCamera, nn.Module):
                 camera = camera_of_images(named, guess, self.needs_camera, self._name)
         form = form_of(sample, camera, fields, self._calls.revision)
         if form is not None and (known := self._calls.plans.entry((), form)) is not None:
-            plan: SamplePlan = known[2]
-            batch = Batch(plan, sample, camera[0] if plan.of_one else camera, predicted)
+            camera = one_or_batch(camera) if camera.intrinsics.ndim > 1 else camera
+            batch = Batch(known.result, sample, camera, must_check=not predicted)
         else:
             batch = self._new_batch(sample, camera, fields, predicted)
-            is_kept = all(v is sample[n] for n, v in batch.values.items())
-            if form is not None and is_kept and batch.camera.intrinsics.device == camera.intrinsics.device:
+            # a plan reads values from the sample, so none may have been converted
+            are_as_given = all(value is sample[name] for name, value in batch.values.items())
+            if form is not None and are_as_given and batch.camera.intrinsics.device == camera.intrinsics.device:
                 self._calls.plans((), form, lambda: batch.plan)
-        if batch.plan.has_matrices:
+        if "K" in batch.plan.fields.values():
             self._check_matrices(batch, sample)
         return batch
 
@@ -246,22 +249,19 @@ class SampleTransform(KeepsCamera, nn.Module):
             name: t for name, (_, value) in named.items() for t in (value if isinstance(value, list) else [value])
         }
         check_devices(owner, **tensors)
-        of_one = isinstance(camera, Camera) and camera.batch_shape == (1,)
         device, camera = next((t.device for t in tensors.values()), torch.device("cpu")), one_or_batch(camera)
         if device.type == "cpu" and are_free():
             warn_if_missing()
         if camera.intrinsics.device != device:
-            own, camera = camera, camera.each(lambda t: t.to(device))
-            if own.intrinsics.is_cpu and not is_unknown(own.intrinsics):
-                remember_camera(camera, own)
+            given, camera = camera, camera.each(lambda t: t.to(device))
+            if given.intrinsics.is_cpu and not is_unknown(given.intrinsics):
+                remember_camera(camera, given)
         kinds = {name: kind for name, (kind, _) in named.items()}
         flags = dict.fromkeys(["image_valid", *(f"{name}_valid" for name, kind in kinds.items() if kind in IMAGES)])
         masks = [key for key in flags if sample.get(key) is not None or (self.valid_mask and key == "image_valid")]
         calls = Kept() if are_free(*tensors.values()) else None
-        plan = SamplePlan(
-            kinds, batched, count, masks, self.mask_fill, calls, device.type == "cpu", of_one, "K" in kinds.values()
-        )
-        return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, True)
+        plan = SamplePlan(kinds, batched, count, masks, self.mask_fill, calls)
+        return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, must_check=False)
 
     def _check_matrices(self, batch: Batch, sample: Sample) -> None:
         """Raise a ValueError if fields K are not the camera of a batch, or cannot be the new one's."""
@@ -287,16 +287,17 @@ class SampleTransform(KeepsCamera, nn.Module):
             change: of as many samples; its `source` are their cameras.
             sample: the fields; a `Single` is one sample, whatever their dims.
             kinds: name -> kind, in addition to `fields`.
-            predicted: whether values may be bad.
+            predicted: whether values come from a network, and are not checked.
         """
         sample = self._given(sample, {})
         if clips := self._clips(sample, kinds):
             return clips.restored(self.moved_by(change, clips.frames(None), kinds, predicted))
         if change.count == 1:
-            own = moving(sample, {**self.fields, **(kinds or {})}, self._name).values()
-            sizes = {len(value) if isinstance(value, (list, tuple)) else value.shape[:1].numel() for _, value in own}
-            if sizes != {1} and all(kind != "image" for kind, _ in own):
-                sample = Single(sample)  # labels of several faces, without the image that tells
+            named = moving(sample, {**self.fields, **(kinds or {})}, self._name).values()
+            rows = {len(value) if isinstance(value, (list, tuple)) else value.shape[:1].numel() for _, value in named}
+            if rows != {1} and all(kind != "image" for kind, _ in named):
+                # one sample: its labels have as many rows as faces, and no image shows that there is no dim B
+                sample = Single(sample)
         first = change.parts[0]
         camera = first.camera if first.rows is None else change.source
         batch = self._batch(sample, camera, predicted, kinds)
@@ -308,37 +309,22 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def _moved(self, sample: Sample, batch: Batch, change: Change) -> Sample:
         """Return the sample with all that moves by a change, what is valid of it, the rotation and the camera."""
-        plan, values, _, checked = batch
-        moved, batched, mirroring = dict(sample), plan.batched, self.mirroring
-        if plan.has_matrices:
+        plan, batched, mirroring = batch.plan, batch.plan.batched, self.mirroring
+        if "K" in plan.fields.values():
             check_targets(plan.fields, change, self._name)
-        together = {} if "image_valid" in plan.masks else plan.together(change, values)
-        options = None
-        for name, kind in plan.fields.items():
-            valid: Any
-            if name in together:
-                moved[name], valid = together[name]
-            else:
-                value: Any = values[name]
-                options = options or {"mask_fill": self.mask_fill, "lateral": mirroring.lateral if mirroring else 0}
-                if isinstance(value, list):
-                    pairs = [move(change.row(i), kind, v.unsqueeze(0), options) for i, v in enumerate(value)]
-                    moved[name] = [rows.squeeze(0) for rows, _ in pairs]
-                    valid = [rows.squeeze(0) for _, rows in pairs if rows is not None] or None
-                else:
-                    if not checked:
-                        KINDS[kind].check(value, name, self._name)
-                    rows, valid = move(change, kind, plan.rows(value), options)
-                    moved[name] = rows if batched else rows.squeeze(0)
-                    valid = valid if batched or valid is None else valid.squeeze(0)
+        moved = dict(sample)
+        options = {"mask_fill": self.mask_fill, "lateral": mirroring.lateral if mirroring else 0}
+        together = {} if "image_valid" in plan.masks else plan.together(change, batch.values)
+        for name in plan.fields:
+            value, valid = together[name] if name in together else batch.moved(name, change, options, self._name)
+            moved[name] = value
             if valid is not None:
-                flags = sample.get(f"{name}_valid")
-                moved[f"{name}_valid"] = (
-                    valid if flags is None else still_valid(f"{name}_valid", valid, flags, self._name)
-                )
+                key = f"{name}_valid"
+                given = sample.get(key)
+                moved[key] = valid if given is None else still_valid(key, valid, given, self._name)
         for key in plan.masks:
             if (seen := self._seen(key, sample.get(key), plan, change)) is not None:
-                moved[key] = seen.contiguous() if batched else seen[0].contiguous()
+                moved[key] = (seen if batched else seen[0]).contiguous()
         if "rotation" not in plan.fields:
             moved["rotation"] = change.rotation_for_sample(batched)
         if mirroring is not None:

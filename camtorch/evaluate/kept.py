@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -11,6 +11,14 @@ from torch import Tensor
 from camtorch.evaluate.door import has_tangent, in_graph, in_transform, is_concrete, is_eager, outside_inference
 
 T = TypeVar("T")
+
+
+class Entry(NamedTuple):
+    """A result that is kept, and what it was computed from."""
+
+    options: tuple[Any, ...]
+    notes: list[Note]
+    result: Any
 
 
 class Kept:
@@ -23,7 +31,7 @@ class Kept:
 
     capacity: int = 1
     result: Any = None  # the one that was returned last, for any inputs
-    _kept: Sequence[tuple[tuple[Any, ...], list[Note], Any]] = ()  # the last one used is first
+    _kept: Sequence[Entry] = ()  # the last one used is first
 
     def __init__(self, capacity: int = 1) -> None:
         self.capacity = capacity
@@ -33,7 +41,7 @@ class Kept:
         if inputs and not is_eager(*inputs) and not all(is_concrete(t) and not has_tangent(t) for t in inputs):
             return compute()
         if (entry := self.entry(inputs, options)) is not None:
-            found: T = entry[2]
+            found: T = entry.result
             self.result = found
             return found
         if in_transform():  # a transform's tensors die with it
@@ -41,16 +49,14 @@ class Kept:
         with torch.inference_mode(False), torch.no_grad():  # a graph cannot use tensors of inference mode
             notes = [note(t) for t in inputs]
             result = compute()
-        self._kept, self.result = [(options, notes, result), *self._kept[: self.capacity - 1]], result
+        self._kept, self.result = [Entry(options, notes, result), *self._kept[: self.capacity - 1]], result
         return result
 
-    def entry(
-        self, inputs: Sequence[Tensor], options: tuple[Any, ...]
-    ) -> tuple[tuple[Any, ...], list[Note], Any] | None:
-        """Return the kept options, notes and result for inputs whose values may be read, or None."""
+    def entry(self, inputs: Sequence[Tensor], options: tuple[Any, ...]) -> Entry | None:
+        """Return what is kept for inputs whose values may be read, or None."""
         known = self._kept
         for i, entry in enumerate(known):
-            if options == entry[0] and all(map(same, inputs, entry[1])):
+            if options == entry.options and all(map(same, inputs, entry.notes)):
                 if i:  # a new list, as another thread may be reading this one
                     self._kept = [entry, *known[:i], *known[i + 1 :]]
                 return entry
