@@ -9,6 +9,7 @@ from test_augment import sample as every_field
 
 import camtorch as ct
 from camtorch.augment import FaceNormalizer, RandomCamera, RandomLens, RandomMount
+from camtorch.augment.sample import Single
 
 SIZE, COUNT = (60, 80), 3
 
@@ -81,3 +82,15 @@ def test_everything_that_comes_out_can_be_edited_in_place(name, own, alone):
             assert torch.equal(tensor, tensors(before)[field]), f"{field} of the given sample"
     if back:
         assert torch.equal(augmentation.inverse(label)["keypoints"], back["keypoints"])
+
+
+def test_a_single_sample_stays_single_and_the_callers():
+    """With keywords too; `FaceNormalizer.inverse` takes fields out of a copy."""
+    faces = Single(keypoints=30 * torch.rand(2, 7, 2))  # of two faces
+    out = AUGMENTATIONS["mount"](faces, camera=camera(), gaze=torch.rand(3))
+    assert (out["rotation"].shape, list(faces)) == ((3, 3), ["keypoints"])
+    pose = torch.cat((torch.eye(3), torch.tensor([[0.0], [0], [1]])), 1)
+    given = Single(AUGMENTATIONS["face"](head_pose=pose, camera=camera()))
+    names = list(given)
+    AUGMENTATIONS["face"].inverse(given)
+    assert list(given) == names
