@@ -13,14 +13,12 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch.augment.cameras import known_camera
 from camtorch.augment.change import Change, Part, by_models, check_sizes, one_or_batch
 from camtorch.augment.devices import Elsewhere, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.matrices import Guess
 from camtorch.augment.ranges import Range, draw_numbers, rows_of
-from camtorch.augment.reading import moving
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
@@ -194,10 +192,10 @@ class Augmentation(SampleTransform):
         if before is None or isinstance(before, (int, float)):
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
             raise ValueError(f"{self._name}: camera must be given; got {before}. Please {how}. {GUESS_CAMERA}")
-        return self._change_where_drawn(one_or_batch(before), self._as_numbers(draw))
+        return self._change_on_host(one_or_batch(before), self._as_numbers(draw))
 
-    def _change_where_drawn(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
-        """Return the change of a draw, computed where the draw is: on the CPU also for fixed cameras elsewhere."""
+    def _change_on_host(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
+        """Return the change of a draw, computed on the CPU also for fixed cameras elsewhere, if the draw is there."""
         host = self._on_host(camera)
         if host is camera or not all(getattr(value, "is_cpu", True) for value in draw.values()):
             return self._change(camera, draw)
@@ -374,14 +372,7 @@ class Augmentation(SampleTransform):
         """
         sample = self._given(sample, fields)
         if clips := self._clips(sample):
-            camera = known_camera(sample.get("camera"), self.camera)
-            frames = clips.frames(one_or_batch(camera) if isinstance(camera, Camera) else camera)
-            drawn = self.drawn(clips.shape[0], self.p, self.same_on_batch, generator) if draw is None else draw
-            each = clips.shape[1]  # a draw takes the boxes that it needs from the first frame
-            first = {n: (kind, value[::each]) for n, (kind, value) in moving(frames, self.fields, self._name).items()}
-            whole = self._with_labels(drawn, lambda: first)
-            draw = {n: clips.repeated(value, f"draw[{n!r}]") for n, value in whole.items()}
-            return clips.restored(self.forward(frames, draw=draw))
+            return clips.augmented(self, draw, generator)
         return self._augmented(sample, draw=draw, generator=generator)[0]
 
     def _augmented(
@@ -400,8 +391,7 @@ class Augmentation(SampleTransform):
         plan, camera, count = batch.plan, batch.camera, batch.plan.count
         if draw is None:
             drawn = self._draw_numbers(count, self.p, self.same_on_batch, generator)
-            numbers = self._with_labels(drawn, batch.rows)
-            change = (self._change if plan.is_cpu else self._change_where_drawn)(camera, numbers)
+            change = self._change_on_host(camera, self._with_labels(drawn, batch.rows))
         else:
             change = self.change(camera, self._with_labels(draw, batch.rows))
         if change.count != count:
@@ -439,7 +429,7 @@ class Augmentation(SampleTransform):
         sample = self._given(sample, fields)
         if clips := self._clips(sample):
             if draw is not None:
-                draw = {name: clips.repeated(value, f"draw[{name!r}]") for name, value in draw.items()}
+                draw = clips.for_frames(draw)
                 camera = clips.repeated(self.camera if camera is None else camera, "camera")
             return clips.restored(self.inverse(clips.frames(sample.get("camera")), draw=draw, camera=camera))
         change = self.last if draw is None else self.change(camera, draw)

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
-from camtorch.augment.fields import OWN, PLACE
+from camtorch.augment.cameras import known_camera
+from camtorch.augment.change import one_or_batch
+from camtorch.augment.fields import OWN, PLACE, Named
 from camtorch.augment.matrices import check_alike
 from camtorch.augment.names import kind_of
+from camtorch.augment.reading import moving
 from camtorch.cameras.camera import Camera
+
+if TYPE_CHECKING:
+    from camtorch.augment.augmentation import Augmentation
 
 
 @dataclass(frozen=True)
 class Clips:
-    """A sample of clips, and the names of its fields that hold a value for each frame."""
+    """A sample of clips, whose fields hold a value for each frame or for each clip."""
 
     sample: Mapping[str, Any]
-    fields: Sequence[str]
-    whole: Sequence[str]  # names of those that hold one for each clip
+    per_frame: Sequence[str]  # names of fields
+    per_clip: Sequence[str]
     shape: tuple[int, ...]  # (B, T), that of `image`
     image: str
     owner: str
@@ -38,23 +45,21 @@ class Clips:
         dims = {name: getattr(value, "ndim", 0) for name, value in given.items()}
         if (image := next((name for name, kind in kinds.items() if kind == "image" and dims[name] == 5), None)) is None:
             return None
-        whole = [
-            "camera",
-            "rotation",
-            PLACE,
-            *(name for name, kind in kinds.items() if kind == "K" and dims[name] != 4),
-        ]
-        own = {name for name, kind in kinds.items() if kind is not None and name not in whole}
-        for name, kind in kinds.items():
-            if kind == "K" and name in own:  # of each frame
+        per_clip = ["camera", "rotation", PLACE]
+        for name in (name for name, kind in kinds.items() if kind == "K"):
+            if dims[name] == 4:  # of each frame
                 check_alike(name, given[name], owner)
-        own |= {f"{name}_valid" for name in own} | {"image_valid", *tables}
-        return cls(sample, [name for name in given if name in own], whole, tuple(given[image].shape[:2]), image, owner)
+            else:
+                per_clip.append(name)
+        found = {name for name, kind in kinds.items() if kind is not None and name not in per_clip}
+        found |= {f"{name}_valid" for name in found} | {"image_valid", *tables}
+        per_frame = [name for name in given if name in found]
+        return cls(sample, per_frame, per_clip, tuple(given[image].shape[:2]), image, owner)
 
     def frames(self, camera: Any) -> dict[str, Any]:
         """Return the sample as a batch of B * T frames, each with the `camera` of its clip, if any."""
         flat = dict(self.sample)
-        for name in self.fields:
+        for name in self.per_frame:
             value = flat[name]
             shape = tuple(getattr(value, "shape", ()))
             if shape[:2] != self.shape or not self.shape[1]:
@@ -63,10 +68,29 @@ class Clips:
                     f"is of clips (B, T, ...); got {f'shape {shape}' if shape else type(value).__name__}"
                 )
             flat[name] = torch.as_tensor(value).flatten(0, 1)
-        for name in self.whole:
+        for name in self.per_clip:
             value = camera if name == "camera" else flat.get(name)
             flat |= {} if value is None else {name: self.repeated(value, name)}
         return flat
+
+    def augmented(
+        self, augmentation: Augmentation, draw: Mapping[str, Tensor] | None, generator: torch.Generator | None
+    ) -> dict[str, Any]:
+        """Return the clips as an augmentation moves them, each by one draw: a given one, or a new one."""
+        camera = known_camera(self.sample.get("camera"), augmentation.camera)
+        frames = self.frames(one_or_batch(camera) if isinstance(camera, Camera) else camera)
+
+        def first_frames() -> Named:  # of which a draw takes the boxes that it needs
+            named = moving(frames, augmentation.fields, self.owner)
+            return {name: (kind, value[:: self.shape[1]]) for name, (kind, value) in named.items()}
+
+        draw = augmentation.draw(self.shape[0], generator) if draw is None else draw
+        draw = self.for_frames(augmentation._with_labels(draw, first_frames))
+        return self.restored(augmentation.forward(frames, draw=draw))
+
+    def for_frames(self, draw: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a draw for the clips as one for their frames."""
+        return {name: self.repeated(value, f"draw[{name!r}]") for name, value in draw.items()}
 
     def repeated(self, value: Any, name: str) -> Any:
         """Return a value (B, ...) of each clip, repeated for each of its frames; a single camera serves all."""
@@ -90,7 +114,7 @@ class Clips:
         """Return moved frames as clips; values of a whole clip, such as its camera, are returned once."""
         result = dict(moved)
         for name, value in moved.items():
-            if name in self.whole:
+            if name in self.per_clip:
                 rows = list(range(0, len(value), self.shape[1]))
                 result[name] = [value[i] for i in rows] if isinstance(value, list) else value[rows]
             elif value is not self.sample.get(name):
