@@ -26,10 +26,10 @@ class Clips:
     """A sample of clips, whose fields hold a value for each frame or for each clip."""
 
     sample: Mapping[str, Any]
-    per_frame: Sequence[str]  # names of fields
+    per_frame: Sequence[str]  # the names of those with a value for each frame
     per_clip: Sequence[str]
     shape: tuple[int, ...]  # (B, T), that of `image`
-    image: str
+    image: str  # the name of the field that tells that these are clips
     owner: str
 
     @classmethod

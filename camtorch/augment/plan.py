@@ -23,7 +23,7 @@ from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import thread_count
 from camtorch.warp.boxes import along_edges, around, corners_of, in_order
 from camtorch.warp.options import Options, Sampler
-from camtorch.warp.samples import Label, MovedField, SampleCall, Sizes, call_for, natives_of
+from camtorch.warp.samples import Label, MovedField, SampleCall, call_for, natives_of
 
 _MIRRORED: Sequence[Label] = "boxes", "rays"
 """Labels of a single sample that one call of C moves beside pixels, also in a mirror."""
@@ -58,7 +58,7 @@ def form_of(
         return None
     intrinsics, distortion = camera.intrinsics, camera.distortion
     numbers = intrinsics.shape, intrinsics.dtype, intrinsics.device, distortion.shape
-    # each thread has calls of its own
+    # each thread keeps plans of its own, as calls of C hold memory that one thread writes
     state = revision, get_ident(), is_free
     return *state, type(camera), camera.image_size, *numbers, type(sample), *values, *fields.items()
 
@@ -106,13 +106,10 @@ class SamplePlan:
             return {}
         if max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != self.count:
             return {}
-        sizes = part.camera.size_for("Warp"), size
-        settings = sizes, source.dtype, labels, thread_count(), *moves.options.values()
-        if (known := calls.entry((), settings)) is None:
-            new = functools.partial(self._new_call, values, sizes, source.dtype, moves.options, labels)
-            names, call = calls((), settings, new)
-        else:
-            names, call = known.result
+        # all that a call of C depends on, beside the form
+        settings = size, source.dtype, labels, thread_count(), *moves.options.values()
+        new = functools.partial(self._new_call, values, part.camera, size, source.dtype, moves.options, labels)
+        names, call = calls((), settings, new)
         if call is None or (moved := call(source, target, rotation, [*map(values.__getitem__, names)])) is None:
             return {}
         results = dict[str, MovedField]()
@@ -125,21 +122,23 @@ class SamplePlan:
     def _new_call(
         self,
         values: Mapping[str, Any],
-        sizes: Sizes,
+        camera: Camera,
+        size: tuple[int, int],
         dtype: torch.dtype,
         options: Options,
         labels: Sequence[Label],
     ) -> tuple[Sequence[str], SampleCall | None]:
         """Return the names of the fields that one call of C moves, and the call; None if no call serves.
 
-        sizes, dtype, options: as of `call_for`. labels: those that it moves beside pixels.
+        camera, size: of the images, and of the new ones. dtype, options: as of `call_for`. labels: those that it moves
+        beside pixels.
         """
         hows: dict[str, Sampler | Label] = {}
         for name, kind in self.fields.items():
             value = values[name]
             if isinstance(value, list) or (how := field_of(kind, value).by_c) == "never":
                 return [], None
-            if how is None or value.ndim - self.batched > KINDS[kind].most_dims:  # of frames
+            if how is None or value.ndim - self.batched > KINDS[kind].most_dims:  # frames move by `move`
                 continue
             if callable(how):
                 sampler = how(options, self.mask_fill)
@@ -148,8 +147,10 @@ class SamplePlan:
                 hows |= {name: how} if self.count == 1 or value.numel() < _MANY_PIXELS else {}
             elif how in labels and value.dtype == dtype and are_numbers(value):
                 hows |= {name: how} if how == "boxes" or value.is_contiguous() else {}
-        chosen = [values[name] for name in hows]
-        return [*hows], call_for(sizes, dtype, options, chosen, [*hows.values()], self.batched) if hows else None
+        if not hows:
+            return [], None
+        sizes, chosen = (camera.size_for("Warp"), size), [values[name] for name in hows]
+        return [*hows], call_for(sizes, dtype, options, chosen, [*hows.values()], self.batched)
 
     def _pixels_at_once(self, part: Part, values: Mapping[str, Any]) -> dict[str, MovedField]:
         """Move all pixels and boxes by one evaluation of the cameras: in torch each takes hundreds of operations."""
