@@ -134,7 +134,9 @@ class Transform(FrontEnd, A.DualTransform):
         sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]
         given = self.camera if data.get("camera") is None else data["camera"]
         matrices = ((name, value) for name, value in data.items() if value is not None and self._is_matrix(name, value))
-        return camera_of_sample(_OWNER, self.augmentation, given, sizes, next(matrices, None))
+        return camera_of_sample(
+            _OWNER, given, self.augmentation.camera, self.augmentation.needs_camera, sizes, next(matrices, None)
+        )
 
     def _is_matrix(self, name: str, value: Any) -> bool:
         name = self._additional_targets.get(name, name)

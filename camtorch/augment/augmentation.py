@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
+from camtorch.augment.cameras import known_camera
 from camtorch.augment.change import Change, Part, by_models, check_sizes, one_or_batch
 from camtorch.augment.devices import Elsewhere, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
@@ -196,7 +197,7 @@ class Augmentation(SampleTransform):
 
     def _change_on_host(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
         """Return the change of a draw, computed on the CPU also for fixed cameras elsewhere, if the draw is there."""
-        host = self._on_host(camera)
+        host = camera if camera.intrinsics.is_cpu else self._on_host(camera)
         if host is camera or not all(getattr(value, "is_cpu", True) for value in draw.values()):
             return self._change(camera, draw)
         return Elsewhere(self._change(host, draw), camera.intrinsics.device)
@@ -372,7 +373,11 @@ class Augmentation(SampleTransform):
         """
         sample = self._given(sample, fields)
         if clips := self._clips(sample):
-            return clips.augmented(self, draw, generator)
+            camera = known_camera(sample.get("camera"), self.camera)
+            frames = clips.frames(one_or_batch(camera) if isinstance(camera, Camera) else camera)
+            draw = self.draw(clips.shape[0], generator) if draw is None else draw
+            draw = self._with_labels(draw, lambda: clips.first_frames(frames, self.fields))
+            return clips.restored(self.forward(frames, draw=clips.for_frames(draw)))
         return self._augmented(sample, draw=draw, generator=generator)[0]
 
     def _augmented(

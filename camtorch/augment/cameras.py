@@ -7,7 +7,7 @@ them is for guesses, and any known camera comes before it. What stands in for a 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -17,9 +17,6 @@ from camtorch.augment.reading import as_tensor, check_one_size
 from camtorch.cameras.camera import Camera
 from camtorch.models import Pinhole
 from camtorch.values.arguments import GUESS_CAMERA, shown
-
-if TYPE_CHECKING:
-    from camtorch.augment.augmentation import Augmentation
 
 
 class Unknown(Pinhole):
@@ -68,18 +65,19 @@ def camera_of_images(named: Named, guess: Guess | None, is_needed: bool, owner: 
 
 def camera_of_sample(
     owner: str,
-    augmentation: Augmentation,
     given: object,
+    own: object,
+    is_needed: bool,
     sizes: Sequence[tuple[str, tuple[int, ...]]],
     matrix: tuple[str, Any] | None = None,
 ) -> Camera:
     """Return the single camera of a sample of a front end.
 
-    given: the camera of the sample, else of the front end. sizes: names and sizes (height, width) of its images.
-    matrix: name and value of a field K.
+    given: the camera of the sample, else of the front end. own: that of the augmentation. is_needed: whether this one
+    needs a camera. sizes: names and sizes (height, width) of images. matrix: name and value of a field K.
     """
-    camera = known_camera(given, augmentation.camera)
-    is_told = not (camera is None and matrix is None and augmentation.needs_camera)
+    camera = known_camera(given, own)
+    is_told = not (camera is None and matrix is None and is_needed)
     if sizes and is_told and (camera is None or isinstance(camera, Guess)):
         height, width = sizes[0][1]
         rows = None if matrix is None else (matrix[0], as_tensor(matrix[1], matrix[0], "K", owner))

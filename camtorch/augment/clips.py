@@ -4,21 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
-from torch import Tensor
 
-from camtorch.augment.cameras import known_camera
-from camtorch.augment.change import one_or_batch
 from camtorch.augment.fields import OWN, PLACE, Named
 from camtorch.augment.matrices import check_alike
 from camtorch.augment.names import kind_of
 from camtorch.augment.reading import moving
 from camtorch.cameras.camera import Camera
-
-if TYPE_CHECKING:
-    from camtorch.augment.augmentation import Augmentation
 
 
 @dataclass(frozen=True)
@@ -73,20 +67,10 @@ class Clips:
             flat |= {} if value is None else {name: self.repeated(value, name)}
         return flat
 
-    def augmented(
-        self, augmentation: Augmentation, draw: Mapping[str, Tensor] | None, generator: torch.Generator | None
-    ) -> dict[str, Any]:
-        """Return the clips as an augmentation moves them, each by one draw: a given one, or a new one."""
-        camera = known_camera(self.sample.get("camera"), augmentation.camera)
-        frames = self.frames(one_or_batch(camera) if isinstance(camera, Camera) else camera)
-
-        def first_frames() -> Named:  # of which a draw takes the boxes that it needs
-            named = moving(frames, augmentation.fields, self.owner)
-            return {name: (kind, value[:: self.shape[1]]) for name, (kind, value) in named.items()}
-
-        draw = augmentation.draw(self.shape[0], generator) if draw is None else draw
-        draw = self.for_frames(augmentation._with_labels(draw, first_frames))
-        return self.restored(augmentation.forward(frames, draw=draw))
+    def first_frames(self, frames: Mapping[str, Any], fields: Mapping[str, str]) -> Named:
+        """Return the fields that move of the first frame of each clip."""
+        named = moving(frames, fields, self.owner)
+        return {name: (kind, value[:: self.shape[1]]) for name, (kind, value) in named.items()}
 
     def for_frames(self, draw: Mapping[str, Any]) -> dict[str, Any]:
         """Return a draw for the clips as one for their frames."""

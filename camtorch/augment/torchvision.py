@@ -117,7 +117,7 @@ class Transform(FrontEnd, v2.Transform):
             raise ValueError(f"{_OWNER}: a sample must have one camera; got {len(cameras)}")
         augmentation, given_camera = self.augmentation, leaves[cameras[0]] if cameras else self.camera
         matrix = next(((keys[i], value) for i, (kind, value, _) in fields.items() if kind == "K"), None)
-        camera = camera_of_sample(_OWNER, augmentation, given_camera, sizes, matrix)
+        camera = camera_of_sample(_OWNER, given_camera, augmentation.camera, augmentation.needs_camera, sizes, matrix)
         is_guessed = matrix is None and isinstance(known_camera(given_camera, augmentation.camera), Guess)
         kinds = {keys[i]: field.kind or KEEP for i, field in fields.items()}
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
