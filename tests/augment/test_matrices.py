@@ -309,6 +309,8 @@ def test_a_dict_of_torchvision_gets_the_guessed_camera(kind, monkeypatch):
         by_matrix = first({"image": torch.rand(3, *SIZE), "boxes": BOXES[0], "K": K})
         assert "camera" not in by_matrix
         assert by_matrix["K"][0, 2] == 23.5
+        whole = first({"image": torch.rand(3, *SIZE), "boxes": BOXES[0], "K": K.round().long()})["K"]
+        assert whole.is_floating_point()  # as the new focal length is none
         image, target = first(torch.rand(3, *SIZE), {"boxes": BOXES[0]})
         assert (tuple(image.shape), [*target]) == ((3, 64, 48), ["boxes"])
 
