@@ -25,7 +25,6 @@ from camtorch.rays.lattices import defined_or
 from camtorch.values.arguments import present
 from camtorch.values.module import model_of, remade
 from camtorch.warp.options import Options
-from camtorch.warp.panorama import PANORAMAS
 
 _SIZES = {"centre": 2, "distortion": structs.AMOUNTS, "place": 2}
 _KINDS = {"yaw": structs.YAW, "pitch": structs.PITCH, "roll": structs.ROLL, "zoom": structs.ZOOM, "fov": structs.WIDTH}
@@ -79,7 +78,7 @@ class Start:
         """Start from the source and the base as native code takes them: `before` and `native`."""
         source, base, size, names = wanted.source, wanted.base, wanted.size, wanted.names
         self.base, self._before, self._native, self._size = base, before, native, size
-        self._share, self._is_flat = wanted.share, not isinstance(source, PANORAMAS) and not isinstance(base, PANORAMAS)
+        self._share, self._is_flat = wanted.share, source.turn_axis is None and base.turn_axis is None
         self._names: list[str] = [name for name in _KINDS if name in names]
         self._has_lists = not _SIZES.keys().isdisjoint(names)  # whether some values are several numbers
         self._batch = tuple(wanted.sized.shape[:-1]) or base.batch_shape  # (B,) if each camera has a lens of its own

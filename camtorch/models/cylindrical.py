@@ -19,6 +19,7 @@ class Cylindrical(Camera):
 
     key = "cylindrical"
     quarter_turn = None
+    turn_axis = 0
 
     @staticmethod
     def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:

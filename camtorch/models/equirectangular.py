@@ -19,6 +19,8 @@ class Equirectangular(Camera):
 
     key = "equirectangular"
     quarter_turn = None
+    turn_axis = 0
+    has_poles = True
 
     @staticmethod
     def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:

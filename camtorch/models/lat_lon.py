@@ -20,6 +20,8 @@ class LatLon(Camera):
 
     key = "latlon"
     quarter_turn = None
+    turn_axis = 1
+    has_poles = True
 
     @staticmethod
     def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:

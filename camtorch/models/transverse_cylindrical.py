@@ -20,6 +20,7 @@ class TransverseCylindrical(Camera):
 
     key = "transverse_cylindrical"
     quarter_turn = None
+    turn_axis = 1
 
     @staticmethod
     def optics(k: Sequence[Tensor]) -> tuple[Chart, Lens]:

@@ -45,6 +45,10 @@ class ModelSpec:
 
     None: the model is not the same on its side.
     """
+    turn_axis: ClassVar[int | None] = None
+    """Where images of a whole turn meet: 0, left and right; 1, top and bottom; None, such images have ends."""
+    has_poles: ClassVar[bool] = False
+    """Whether images of a whole turn end, along the other axis, in rows or columns that show one direction, a pole."""
     special_cases: ClassVar[tuple[tuple[str, tuple[str, ...]], ...]] = ()
     """The models that this one generalises: the key of each, and the names here of its coefficients in its order.
 

@@ -9,7 +9,6 @@ from camtorch.evaluate.devices import sent
 from camtorch.evaluate.tensors import is_predicted, known_true
 from camtorch.native.structs import EDGE_POINTS
 from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes
-from camtorch.warp.panorama import PANORAMAS
 from camtorch.warp.plan import CameraPair
 
 _ROUNDED = 1e-3  # pixels from a panorama's edges, where rounding would cost rays
@@ -47,9 +46,10 @@ def around(warp: CameraPair, corners: Tensor, moved: Tensor, mapped: Tensor) -> 
     some, valid = mapped.any(-1), (mapped & warp.target.contains(moved)).any(-1)
     # a polygon about a direction that the target does not map is turned inside out
     plain = valid & mapped.all(-1) & (_area(corners) * _area(moved) > 0)
-    if isinstance(warp.target, PANORAMAS) or not known_true(plain):
+    is_panorama = warp.target.turn_axis is not None
+    if is_panorama or not known_true(plain):
         lattice, inside = _inside(warp, corners, moved)
-        inside = inside & finite & (isinstance(warp.target, PANORAMAS) | ~plain.unsqueeze(-1))  # row by row
+        inside = inside & finite & (is_panorama | ~plain.unsqueeze(-1))  # row by row
         some, valid = some | inside.any(-1), valid | inside.any(-1)
         inside = inside.unsqueeze(-1)
         low = torch.minimum(low, torch.where(inside, lattice, torch.inf).amin(-2))
@@ -62,7 +62,7 @@ def _inside(warp: CameraPair, corners: Tensor, like: Tensor) -> tuple[Tensor, Te
     height, width = warp.target.size_for("Warp")
     host, device = warp.host, like.device
     share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device="cpu" if host else device)
-    if isinstance(warp.target, PANORAMAS):
+    if warp.target.turn_axis is not None:
         share = share.clamp(_ROUNDED / height, 1 - _ROUNDED / height)
     lattice = torch.cartesian_prod(share * width, share * height) - 0.5
     with torch.no_grad():

@@ -10,14 +10,10 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import values_of
-from camtorch.models import Cylindrical, Equirectangular, LatLon, TransverseCylindrical
 from camtorch.values.module import remade
 
 _NEAR = 0.05  # pixels by which a whole turn may miss the edges: a focal length of two decimals misses by 0.03
 _RIM = 16  # pixels beyond an edge: bicubic samples of images halved three times read so far
-_SPHERES = Equirectangular, LatLon
-_DOWN = LatLon, TransverseCylindrical
-PANORAMAS = Equirectangular, Cylindrical, *_DOWN
 
 
 class Seam(NamedTuple):
@@ -61,16 +57,15 @@ def with_seam(camera: Camera, seam: Seam | None) -> Camera:
 
 def seam_of(camera: Camera) -> Seam | None:
     """Return how far a camera's whole-turn images are extended, or None; in traced code, the last result."""
-    if not isinstance(camera, PANORAMAS):
+    if (axis := camera.turn_axis) is None:
         return None
     numbers = values_of(camera.intrinsics)
     if numbers is not None:
-        camera._seam = _found(camera, numbers.reshape(-1, 4))  # type: ignore[assignment]
+        camera._seam = _found(camera, axis, numbers.reshape(-1, 4))  # type: ignore[assignment]
     return getattr(camera, "_seam", None)
 
 
-def _found(camera: Camera, numbers: Tensor) -> Seam | None:
-    axis = int(isinstance(camera, _DOWN))
+def _found(camera: Camera, axis: int, numbers: Tensor) -> Seam | None:
     sides = camera.size_for("Warp")[::-1]
     side, other = sides[axis], sides[1 - axis]
     if not len(numbers) or not bool(((math.tau * numbers[:, axis] - side).abs() < _NEAR).all()):
@@ -82,7 +77,7 @@ def _found(camera: Camera, numbers: Tensor) -> Seam | None:
         return None
     rims = [end + min(_RIM, side - end) for end in beyond]
     poles = [0, 0]
-    if isinstance(camera, _SPHERES):
+    if camera.has_poles:
         focal, centre = numbers[:, 1 - axis], numbers[:, 3 - axis]
         for i, (edge, pole) in enumerate(((-0.5, -math.pi / 2), (other - 0.5, math.pi / 2))):
             if bool(((edge - centre - pole * focal).abs() < _NEAR).all()):
@@ -91,33 +86,32 @@ def _found(camera: Camera, numbers: Tensor) -> Seam | None:
     return Seam(axis, (first[0], first[1], second[0], second[1]))
 
 
-def goes_round(camera: Camera) -> Tensor | None:
-    """Return the numbers (C, 4) of a panorama whose images show a whole turn or more; None for other cameras."""
-    if not isinstance(camera, PANORAMAS) or (numbers := values_of(camera.intrinsics)) is None:
+def goes_round(camera: Camera) -> tuple[int, Tensor] | None:
+    """Return the axis and the numbers (C, 4) of a panorama whose images show a whole turn or more; None for others."""
+    if (axis := camera.turn_axis) is None or (numbers := values_of(camera.intrinsics)) is None:
         return None
-    axis, numbers = int(isinstance(camera, _DOWN)), numbers.reshape(-1, 4)
-    return numbers if bool((math.tau * numbers[:, axis] < camera.size_for("Warp")[1 - axis] + _NEAR).all()) else None
+    numbers, side = numbers.reshape(-1, 4), camera.size_for("Warp")[1 - axis]
+    return (axis, numbers) if bool((math.tau * numbers[:, axis] < side + _NEAR).all()) else None
 
 
 def lengths(camera: Camera, steps: tuple[Tensor, Tensor], grid: tuple[Tensor, Tensor]) -> Tensor:
     """Return the lengths (B, h, w) of steps on a camera's image in pixels; on a panorama, as in the scene."""
-    if (numbers := goes_round(camera)) is None:
+    if (turn := goes_round(camera)) is None:
         return torch.hypot(*steps)
-    axis, sides = int(isinstance(camera, _DOWN)), camera.size_for("Warp")[::-1]
-    numbers, other = numbers[..., None, None].to(grid[0]), 1 - axis
-    period = math.tau * numbers[:, axis]
+    axis, numbers = turn[0], turn[1][..., None, None].to(grid[0])
+    period, other = math.tau * numbers[:, axis], 1 - axis
     along = steps[axis] - period * (steps[axis] / period).round()
-    if isinstance(camera, _SPHERES):
-        place = ((grid[other] + 1) * sides[other] - 1) / 2
+    if camera.has_poles:
+        place = ((grid[other] + 1) * camera.size_for("Warp")[1 - other] - 1) / 2
         along = along * ((place - numbers[:, 2 + other]) / numbers[:, other]).cos()
     return torch.hypot(along, steps[other])
 
 
 def off_poles(camera: Camera, rays: Tensor) -> Tensor:
     """Return rays (..., 3) moved off the poles of a sphere, where its image has a row of pixels and its model none."""
-    if not isinstance(camera, _SPHERES):
+    if (axis := camera.turn_axis) is None or not camera.has_poles:
         return rays
-    axis, planes = int(isinstance(camera, _DOWN)), list(rays.unbind(-1))
+    planes = list(rays.unbind(-1))
     least = planes[1 - axis].abs() * torch.finfo(rays.dtype).eps
     at_pole = torch.maximum(planes[axis].abs(), planes[2].abs()) < least
     planes[2] = torch.where(at_pole, least, planes[2])
@@ -126,13 +120,13 @@ def off_poles(camera: Camera, rays: Tensor) -> Tensor:
 
 def within_turn(camera: Camera, pixels: Tensor) -> Tensor:
     """Return pixels ([B,] h, w, 2); those of a whole turn are wrapped to pixels for which the model has rays."""
-    if seam_of(camera) is None:
+    if (seam := seam_of(camera)) is None:
         return pixels
-    axis, sides = int(isinstance(camera, _DOWN)), camera.size_for("Warp")[::-1]
+    axis, side = seam.axis, camera.size_for("Warp")[1 - seam.axis]
     numbers, planes = camera.intrinsics.detach(), list(pixels.unbind(-1))
     numbers = numbers.reshape(*numbers.shape[:-1], *[1] * (pixels.ndim - numbers.ndim), 4)
     offset = planes[axis] - numbers[..., 2 + axis]
-    offset = offset - (offset / sides[axis]).round() * sides[axis]
+    offset = offset - (offset / side).round() * side
     end = math.pi * (1 - 8 * torch.finfo(numbers.dtype).eps) * numbers[..., axis]  # pi itself is rounded beyond the end
     planes[axis] = numbers[..., 2 + axis] + torch.maximum(torch.minimum(offset, end), -end)
     return torch.stack(torch.broadcast_tensors(*planes), -1)

@@ -231,6 +231,7 @@ class InMotion:
         self.shutter = shutter
         self.batch_shape: torch.Size = broadcast_shapes(camera.batch_shape, shutter.batch_shape)
         self.size: tuple[int, int] = camera.size_for("Warp")
+        self.turn_axis = None  # a panorama ends at its edges
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.camera, name)

@@ -33,7 +33,9 @@ TOLERATED = (
 )
 
 # of models, whose types are those of `Camera`
-CONSTANTS = re.compile(r"\.(special_cases|fit_(starts|counts|bounds)|odd_in_[xy]|quarter_turn)$|Mixed\.from_fov$")
+CONSTANTS = re.compile(
+    r"\.(special_cases|fit_(starts|counts|bounds)|odd_in_[xy]|quarter_turn|turn_axis|has_poles)$|Mixed\.from_fov$"
+)
 ROOMS = ct, ct.augment, importlib.import_module("camtorch.augment.kornia"), ct.data, ct.io, ct.losses, ct.views
 NAMES = [getattr(room, name) for room in ROOMS for name in room.__all__]
 NAMES += [typing.get_type_hints(name).get("return") for name in NAMES if inspect.isfunction(name)]
