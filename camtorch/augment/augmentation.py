@@ -243,7 +243,7 @@ class Augmentation(SampleTransform):
                     part = self._part(source, rows_of(draw, samples)) if moves else Part(source)
                     parts.append(replace(part, rows=samples))
         check_sizes((part.image_size for part in parts), self._name)
-        return Change(count, parts, keeps_mixed=isinstance(camera, Mixed))
+        return Change(count, parts, mixed=isinstance(camera, Mixed))
 
     def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
         """Return what parts of a `Compose` must do if this one, called `name`, cannot precede `later` ones; or None."""

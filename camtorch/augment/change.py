@@ -18,6 +18,7 @@ from camtorch.evaluate.tensors import are_numbers, known_false, known_true
 from camtorch.poses.rotations import is_right, turn
 from camtorch.projection.evaluation import camera_rows
 from camtorch.projection.native_cameras import Native
+from camtorch.values.arguments import warn
 from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import remade
 from camtorch.warp.affine import AffineWarp, UncheckedWarp, after, made_like
@@ -190,6 +191,11 @@ class Part:
         return replace(moved, light=light)
 
 
+_BEFORE = {"several": ("camera_for_sample", True), "single": ("camera_for_sample", False)}
+_BEFORE["single_rotation"] = "rotation_for_sample", False
+"""Names of `Change` before 0.6: what replaces them, and whether that is for a batch."""
+
+
 def _turned(first: Tensor | None, second: Tensor | None) -> Tensor | None:
     """Return the rotation (3, 3) or (B, 3, 3) of two in turn; None is none."""
     if first is None or second is None:
@@ -212,18 +218,18 @@ class Change:
     Args:
         count: how many samples.
         parts: every sample is in one of them.
-        keeps_mixed: return a `Mixed`, as the cameras came, even if all cameras are of one model.
+        mixed: return a `Mixed`, as the cameras came, even if all cameras are of one model.
         gate: (count,) bool, where values may not be looked at: which rows of the only part move.
     """
 
-    __slots__ = ("_inverse", "_order", "count", "gate", "keeps_mixed", "parts")
+    __slots__ = ("_inverse", "_order", "count", "gate", "mixed", "parts")
     count: int
     parts: list[Part]
-    keeps_mixed: bool
+    mixed: bool
     gate: Tensor | None
 
-    def __init__(self, count: int, parts: Sequence[Part], *, keeps_mixed: bool = False, gate: Tensor | None = None):
-        self.count, self.parts, self.keeps_mixed, self.gate = count, list(parts), keeps_mixed, gate
+    def __init__(self, count: int, parts: Sequence[Part], *, mixed: bool = False, gate: Tensor | None = None):
+        self.count, self.parts, self.mixed, self.gate = count, list(parts), mixed, gate
         self._inverse: Change | None = None
         self._order: list[int] | None = None
         if self.parts[0].rows is not None:
@@ -257,7 +263,7 @@ class Change:
         check_sizes(camera.size_for("Change") for camera in cameras)
         together = Mixed.of_groups(list(zip(rows, batches, strict=True)))
         groups = together.groups
-        return together if self.keeps_mixed or len(groups) > 1 else groups[0][1]
+        return together if self.mixed or len(groups) > 1 else groups[0][1]
 
     def _in_order(self, pieces: Sequence[Tensor]) -> Tensor:
         """Return rows, given part by part, as a batch of all samples."""
@@ -275,7 +281,7 @@ class Change:
         if isinstance(moves := first.moves, LazyWarp):
             if not batched and moves.intrinsics.ndim == 1:
                 return moves.new_target()
-            if batched and first.rows is None and not self.keeps_mixed:
+            if batched and first.rows is None and not self.mixed:
                 return moves.new_target(None if moves.intrinsics.ndim == 2 else self.count)
         if batched or self.gate is not None:
             return (self.target if batched else self.target[0]).clone()
@@ -288,6 +294,13 @@ class Change:
         if batched or self.gate is not None or (rotation is not None and rotation.ndim > 2):
             return (self.rotation if batched else self.rotation[0]).clone()
         return _eye(self.parts[0].camera.intrinsics) if rotation is None else rotation.clone()
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in _BEFORE:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        method, batched = _BEFORE[name]
+        warn(f"Change.{name} is now Change.{method}({batched}); 0.7 removes the old name", FutureWarning)
+        return getattr(self, method)(batched)
 
     @property
     def rotation(self) -> Tensor:
@@ -333,9 +346,9 @@ class Change:
             raise ValueError(
                 "Compose: compiled code must have p=1 of all but edits, as it may not look at draws; got less"
             )
-        keeps_mixed = self.keeps_mixed or second.keeps_mixed
+        mixed = self.mixed or second.mixed
         if all(part.rows is None for part in (*self.parts, *second.parts)):
-            return Change(self.count, [self.parts[0].then(second.parts[0])], keeps_mixed=keeps_mixed)
+            return Change(self.count, [self.parts[0].then(second.parts[0])], mixed=mixed)
 
         def places(change: Change) -> list[tuple[Part, dict[int, int]]]:
             """Return each part, with where each of its samples is among its rows."""
@@ -350,12 +363,12 @@ class Change:
                     part if rows == list(place) else part.take([place[row] for row in rows]) for part, place in pairs
                 )
                 parts.append(replace(first.then(last), rows=rows))
-        return Change(self.count, parts, keeps_mixed=keeps_mixed)
+        return Change(self.count, parts, mixed=mixed)
 
     def with_options(self, options: Options) -> Change:
         """Return the change with its warps made anew by other options."""
         parts = [part.with_options(options) for part in self.parts]
-        return Change(self.count, parts, keeps_mixed=self.keeps_mixed, gate=self.gate)
+        return Change(self.count, parts, mixed=self.mixed, gate=self.gate)
 
     def row(self, i: int) -> Change:
         """Return the change of one sample."""
@@ -372,7 +385,7 @@ class Change:
             part if part.moves is None else Part(part.target, part.warp.inverse(), rows=part.rows)
             for part in self.parts
         ]
-        self._inverse = Change(self.count, parts, keeps_mixed=self.keeps_mixed, gate=self.gate)
+        self._inverse = Change(self.count, parts, mixed=self.mixed, gate=self.gate)
         return self._inverse
 
     def each(
@@ -533,7 +546,7 @@ def by_models(
     if not isinstance(camera, Mixed):
         return Change(count, [part(None, camera)], gate=gate)
     parts = [replace(part(rows, source), rows=rows) for rows, source in camera.groups]
-    return Change(count, parts, keeps_mixed=True, gate=gate)
+    return Change(count, parts, mixed=True, gate=gate)
 
 
 def one_or_batch(camera: Camera | Sequence[Camera]) -> Camera:

@@ -24,7 +24,7 @@ def known_true(condition: Tensor) -> bool:
 
 def may_look_at(values: Tensor, *others: Tensor) -> bool:
     """Whether a formula may read values: to leave out what points need that are not valid, or steps that move none."""
-    return values.numel() > 0 and is_eager(values, *others)
+    return is_eager(values, *others) and values.numel() > 0
 
 
 def is_unknown(tensor: Tensor) -> bool:
