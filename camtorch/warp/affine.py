@@ -147,7 +147,7 @@ class UncheckedWarp(Warp):
         if way.halvings:
             images = _resized(images, [max(-(-side >> way.halvings), 1) for side in images.shape[-2:]])
         where = self.positions(route, way.padding_mode)
-        return render(images, where if rows is None else where.cameras(rows), *sampler)
+        return render(images, where if rows is None else where.cameras(rows), sampler)
 
     def _empty(self, images: Tensor) -> Tensor:
         cameras, size = self.batch_shape.numel(), self.image_size

@@ -108,4 +108,4 @@ def _warp(
     found = partial(locate, source, target, rotation, tolerance, bool(antialias), every, padding)
     inputs = [*source.tensors, *target.tensors, *([] if rotation is None else [rotation])]
     where = _located(inputs, (source.form, target.form, tolerance, antialias, padding, rotation is None), found)
-    return (laid(render(images, where, *how), is_last),)
+    return (laid(render(images, where, how), is_last),)

@@ -86,7 +86,7 @@ class CropsWarp(Warp):
         # the crops of an image are sampled as one, the first on top
         where = rows.by_pixel()
         parts = [None if part is None else part.unflatten(0, batch).flatten(1, 2) for part in where]
-        made = render(rows.lengthened(images), PixelPositions(*parts), *sampler)  # type: ignore[arg-type]
+        made = render(rows.lengthened(images), PixelPositions(*parts), sampler)  # type: ignore[arg-type]
         return torch.unflatten(made, 2, (batch[1], self.target.height)).movedim(2, 1).contiguous()  # type: ignore[return-value]
 
     def strips(self, *args: Any, **options: Any) -> Iterator[Any]:

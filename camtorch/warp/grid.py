@@ -272,6 +272,7 @@ def _found(
 def _found_by_torch(
     cameras: Between, first: int, size: tuple[int, int], tolerance: float, padding: str, learns: bool
 ) -> Lattice | None:
+    """Return the same of exact positions by torch, as of several models in a batch, or without the library."""
     n, m = (math.ceil(side / STEP) for side in size)
     limits = source_size, _, _ = cameras.source.size_for("Warp"), tolerance, padding
     # the library finds cubics for each cell; torch alone first looks one node further, whether quintics do everywhere

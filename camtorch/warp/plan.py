@@ -289,7 +289,7 @@ class CameraPair(GeometryModule):
             kept: dict[int, Pyramid] = {}
             for rows, where in self.strip_positions(sampler.padding_mode):
                 with torch.no_grad():
-                    render(images, where, *sampler, kept, result[:, :, rows])
+                    render(images, where, sampler, kept, result[:, :, rows])
             return result
         known: KeptPositions | None = self._kept.result
         where = self.positions(route, sampler.padding_mode)
@@ -361,7 +361,7 @@ class CameraPair(GeometryModule):
         images = self.lengthened(images)
         for rows, where in self.strip_positions(sampler.padding_mode, count):
             with torch.no_grad():
-                part, valid = render(images, where, *sampler, kept), self.on_image(where)
+                part, valid = render(images, where, sampler, kept), self.on_image(where)
             yield rows, part, valid
 
     def on_image(self, where: Positions) -> Tensor:

@@ -18,7 +18,7 @@ from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import GeometryModule, typed_as
 from camtorch.warp.grid import to_positions
 from camtorch.warp.lattice import PixelPositions
-from camtorch.warp.options import Fill, Mode, PaddingMode, as_options
+from camtorch.warp.options import Fill, Mode, PaddingMode, Sampler, as_options
 from camtorch.warp.panorama import off_poles, seam_of
 from camtorch.warp.sampling import render
 from camtorch.warp.warp import as_sized
@@ -117,7 +117,7 @@ class Reproject(GeometryModule):
         positions = to_positions(seen.flatten(1, 2), valid.flatten(1, 2), (images.shape[-2], images.shape[-1]))
         valid = valid & (positions.detach().abs() <= 1).all(-1).view(valid.shape)
         where = PixelPositions(positions, valid.flatten(1, 2), None)
-        result = render(images, where, mode, self.padding_mode, self.fill)
+        result = render(images, where, Sampler(mode, self.padding_mode, self.fill))
         valid = valid.expand(max(rows, len(result)), *valid.shape[1:])[:, None]
         if steps == 1:
             return result, valid[:, :, 0]

@@ -17,7 +17,7 @@ from camtorch.values.dtypes import SIGNED, as_pixels, narrow, wide_dtype, widen
 from camtorch.values.threads import thread_count
 from camtorch.warp.grid_sample import is_sampled_natively, padded, sample
 from camtorch.warp.lattice import PixelPositions, Positions
-from camtorch.warp.options import Mode, PaddingMode, Sampler
+from camtorch.warp.options import PaddingMode, Sampler
 
 SHRINKS = 1.5  # pixels of the image to one of the result, from which on edits antialias by themselves
 SURELY = 0.999  # of that: images that shrink less do not antialias, whatever rounding does
@@ -30,9 +30,7 @@ _TRACED_LEVELS = 4  # if the values that decide cannot be read: down to a sixtee
 def render(
     images: Tensor,
     where: Positions,
-    mode: Mode,
-    padding_mode: PaddingMode,
-    fill: tuple[float, ...],
+    how: Sampler,
     kept: dict[int, Pyramid] | None = None,
     out: Tensor | None = None,
 ) -> Tensor:
@@ -42,7 +40,6 @@ def render(
     Images that are computed in another dtype are copied in parts. `kept` holds halves of the images for the next call,
     and `out` takes a result without a graph.
     """
-    how = Sampler(mode, padding_mode, fill)
     call = prepared(images, where, how, out)
     return by_torch(images, where, how, kept, out) if call is None else call(images, out)
 

@@ -11,6 +11,7 @@ import camtorch as ct
 from camtorch.native.library import native_available
 from camtorch.warp import grid_sample, sampling
 from camtorch.warp.lattice import PixelPositions
+from camtorch.warp.options import Sampler
 
 
 @pytest.mark.skipif(not native_available(), reason="autograd keeps more of the formula")
@@ -71,7 +72,7 @@ def test_parts_of_images_change_nothing(threads, count, dtype, monkeypatch):
     positions = 2.4 * torch.rand(count, 7, 5, 2, generator=generator) - 1.2
     where = PixelPositions(positions, torch.ones(count, 7, 5, dtype=torch.bool), None)
     for mode in ("bilinear", "nearest", "bicubic"):
-        result = sampling.render(images, where, mode, "zeros", (0.0,))
+        result = sampling.render(images, where, Sampler(mode, "zeros", (0.0,)))
         wide = images.double() if dtype == torch.float64 else images.float()
         expected = F.grid_sample(wide, positions.to(wide.dtype), mode, "zeros", align_corners=False)
         if dtype == torch.uint8:

@@ -21,7 +21,7 @@ from camtorch.values.dtypes import widen
 from camtorch.warp import grid as positions
 from camtorch.warp import grid_sample, sampling
 from camtorch.warp.lattice import Lattice, PixelPositions
-from camtorch.warp.options import MODES, PADDINGS
+from camtorch.warp.options import MODES, PADDINGS, Sampler
 
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 INTEGERS = (torch.bool, torch.uint8, torch.int8, torch.uint16, torch.int16, torch.int32, torch.int64)
@@ -117,12 +117,12 @@ def compare(result, expected, mode, unsure, span):
 def both(images, where, mode, padding, fill=(0.0,), span=None):
     """What the native sampler makes, which is what torch makes."""
     with counted() as calls:
-        result = sampling.render(images, where, mode, padding, fill)
+        result = sampling.render(images, where, Sampler(mode, padding, fill))
     # what is computed in float32 is sampled so too, if nothing is to be filled in afterwards
     wide = padding == "zeros" and widen(images[:0]).dtype == torch.float32
     assert bool(calls) == (sampler.takes(images.dtype, mode) or wide)
     with torch_alone(), counted() as calls:
-        expected = sampling.render(images, where, mode, padding, fill)
+        expected = sampling.render(images, where, Sampler(mode, padding, fill))
     assert not calls
     compare(result, expected, mode, between(where.pixels.grid, images.shape[-2:]), span or extent(images.dtype))
     return result
@@ -266,7 +266,7 @@ def test_positions_that_are_far_or_no_numbers(dtype, mode, padding):
             if both_axes:
                 grid[..., 1] = strange
             where = PixelPositions(grid, torch.ones(1, *size, dtype=torch.bool), None)
-            result = sampling.render(images, where, mode, padding, (1.0,))
+            result = sampling.render(images, where, Sampler(mode, padding, (1.0,)))
             assert result.shape == (1, 3, *size)
             assert result.isfinite().all()
             if math.isnan(strange) or (padding == "zeros" and abs(strange) > 2):
