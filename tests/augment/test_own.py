@@ -71,3 +71,13 @@ def test_what_it_gets_wrong_is_told():
         ct.augment.Range(2, 1)
     with pytest.raises(NotImplementedError):
         ct.augment.Augmentation(camera=camera())(keypoints=torch.zeros(1, 2))
+
+
+@pytest.mark.parametrize(("old", "new"), [("single", "camera_for_sample"), ("single_rotation", "rotation_for_sample")])
+def test_names_of_a_change_before_0_6_work_and_name_their_successors(old, new):
+    augment = ct.augment.RandomMount(yaw=10, camera=ct.Pinhole([80.0, 80.0, 31.5, 23.5], image_size=(48, 64)))
+    augment(image=torch.zeros(3, 48, 64))
+    with pytest.warns(FutureWarning, match=rf"Change\.{new}\(False\); 0\.7 removes"):
+        given = getattr(augment.last, old)
+    expected = getattr(augment.last, new)(False)
+    assert torch.equal(getattr(given, "intrinsics", given), getattr(expected, "intrinsics", expected))
