@@ -23,8 +23,8 @@ from camtorch.augment.ranges import Range, draw_numbers, rows_of
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
-from camtorch.evaluate.door import has_tangent, keeps_graph, may_look
-from camtorch.evaluate.tensors import are_known, are_numbers, known_false, known_true
+from camtorch.evaluate.door import has_tangent, is_cheap_to_read, keeps_graph
+from camtorch.evaluate.tensors import are_concrete, are_numbers, known_false, known_true
 from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_part, as_whole, hinting, warn
 from camtorch.values.module import typed_as
 from camtorch.warp.views import place_of
@@ -329,7 +329,7 @@ class Augmentation(SampleTransform):
             return
         camera = self._on_host(camera)
         camera = camera[0] if camera.is_mixed else camera
-        if not are_known(camera.intrinsics):
+        if not are_concrete(camera.intrinsics):
             return
         self._calls.warned = True
         values = draw_numbers(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
@@ -477,7 +477,7 @@ class Augmentation(SampleTransform):
 
 def _chosen(applied: Any) -> list[bool] | None:
     """Return which samples a draw moves, (B,); None if values may not be read."""
-    if isinstance(applied, Tensor) and len(applied) and not may_look(applied):
+    if isinstance(applied, Tensor) and len(applied) and not is_cheap_to_read(applied):
         return None
     return applied if isinstance(applied, list) else applied.tolist()
 

@@ -225,7 +225,7 @@ class CameraDrawer(Augmentation):
             sizes = source.image_size, None if like is None else like.image_size
             key = "start", type(source), *sizes, self._calls.revision, self.ranges.get("fov"), self.min_filled, *values
             known = self._memo.entry(tensors, key)
-            found = self._memo(tensors, key, start) if known is None else known[2]
+            found = self._memo(tensors, key, start) if known is None else known.result
         if found is None:
             return None
         return found.warp(values, source if like is None and not self._is_real else found.base, self._warp_options)

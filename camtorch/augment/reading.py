@@ -12,7 +12,7 @@ from torch import Tensor
 from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS, OWN, PLACE, Named
 from camtorch.augment.names import kind_of
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.door import may_look
+from camtorch.evaluate.door import is_cheap_to_read
 from camtorch.evaluate.tensors import known_true
 from camtorch.values.arguments import warn
 from camtorch.values.dtypes import check_averaged
@@ -192,7 +192,7 @@ def warn_of_numbers(kind: str, name: str, value: Tensor, flags: Any, size: Seque
 
 def _are_off(points: Tensor, flags: Any, size: Sequence[int]) -> bool:
     """Whether most points (..., 2), of those that are seen, are off the image by more than a tenth of its sides."""
-    if not points.numel() or not may_look(points):
+    if not points.numel() or not is_cheap_to_read(points):
         return False
     places, sides = points.detach().reshape(-1, 2), (size[1], size[0])
     ends = zip(places.amin(0).tolist(), places.amax(0).tolist(), sides, strict=True)

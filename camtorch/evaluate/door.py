@@ -190,7 +190,7 @@ def is_eager(*tensors: Tensor) -> bool:
     return True
 
 
-def may_look(tensor: Tensor) -> bool:
+def is_cheap_to_read(tensor: Tensor) -> bool:
     """Whether the values may be read and that costs next to nothing, to take a shorter way with a whole block."""
     return tensor.is_cpu and is_concrete(tensor) and 0 not in tensor.shape
 
@@ -232,11 +232,6 @@ def way_of(owner: str, values: Tensor, *parameters: Tensor) -> Way:
     is_known = all(is_concrete(t) and not has_tangent(t) for t in parameters)
     # torch.compile records no derivatives of derivatives
     return Way(False, False, is_known, 1 if torch.compiler.is_compiling() else 2)
-
-
-def is_native(values: Tensor) -> bool:
-    """Whether native code may read values, in a call without tracing or transforms."""
-    return in_memory(values) and not is_recorded()
 
 
 def while_loop(condition: Callable[..., Any], body: Callable[..., Any], state: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -1,4 +1,19 @@
-"""Questions about tensors when a call begins: their values, if they may be read, and whether they learn."""
+"""Questions about tensors when a call begins: their values, if they may be read, and whether they learn.
+
+What the questions of this file and of `door.py` say of a plain tensor on the CPU, of one that learns, of one that a
+transform of torch.func holds, of one beside such a transform, of a dual one, and of one that is traced for a graph:
+
+    question            plain  learns  in func  beside func  dual  traced
+    is_concrete         yes    yes     no       yes          yes   no      the values can be read
+    is_cheap_to_read    yes    yes     no       yes          yes   no      on the CPU, at once
+    not is_unknown      yes    yes     no       no           yes   no      what is made of them may be kept
+    is_eager            yes    yes     no       no           no    no      nothing watches the call at all
+    may_branch_on       yes    yes     no       no           no    no      as `is_eager`, of some values
+    are_free            yes    no      no       no           no    no      and autograd does not record
+    are_numbers         yes    no      no       no           no    no      and no tensor is of a subclass
+    are_plain           yes    no      no       no           no    no      on the CPU, and no derivative, even under `no_grad`
+    in_graph            no     yes     yes      no           yes   yes     derivatives pass, or it is traced
+"""
 
 from __future__ import annotations
 
@@ -9,7 +24,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from camtorch.evaluate.door import in_graph, in_transform, is_concrete, is_eager, is_recorded, may_look
+from camtorch.evaluate.door import in_graph, in_transform, is_cheap_to_read, is_concrete, is_eager, is_recorded
 
 
 def known_false(condition: Tensor) -> bool:
@@ -19,10 +34,10 @@ def known_false(condition: Tensor) -> bool:
 
 def known_true(condition: Tensor) -> bool:
     """Whether a condition is known to hold everywhere: False if finding out would take more than a quick look."""
-    return may_look(condition) and bool(condition.all())
+    return is_cheap_to_read(condition) and bool(condition.all())
 
 
-def may_look_at(values: Tensor, *others: Tensor) -> bool:
+def may_branch_on(values: Tensor, *others: Tensor) -> bool:
     """Whether a formula may read values: to leave out what points need that are not valid, or steps that move none."""
     return is_eager(values, *others) and values.numel() > 0
 
@@ -42,7 +57,7 @@ def are_plain(*tensors: Tensor) -> bool:
     return not in_transform() and all(t.is_cpu and not in_graph(t) for t in tensors)
 
 
-def are_known(*tensors: Tensor) -> bool:
+def are_concrete(*tensors: Tensor) -> bool:
     """Whether the values of all tensors may be read."""
     return all(map(is_concrete, tensors))
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from camtorch.evaluate.export import as_index, is_portable_export, of_points, repeat, times
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.recorded import CLASSES
-from camtorch.evaluate.tensors import are_known, may_look_at
+from camtorch.evaluate.tensors import are_concrete, may_branch_on
 from camtorch.native.structs import NODES
 from camtorch.optics.charts import even_steps_and_ratios
 from camtorch.optics.radial import RadialFactor
@@ -178,7 +178,7 @@ class InverseTable:
 
 def solve(radial: RadialFactor, table: InverseTable, r2: Tensor) -> tuple[Tensor, Tensor]:
     """Return the factor by which the inverse scales points of squared radius r2, and a number > 0 if it converged."""
-    scale, converged, looks = table(r2), None, may_look_at(r2)
+    scale, converged, looks = table(r2), None, may_branch_on(r2)
     for _ in range(MOST_STEPS):  # of Newton's method for s R(r2 s^2) = 1, in which the axis is not special
         t = r2 * scale * scale
         factor, slope = radial.derivatives(t, 1)
@@ -296,7 +296,7 @@ _radial_inverse = torch.library.custom_op("camtorch::radial_inverse", _compute_i
 
 def _inverse_of(name: str, k: Tensor, end: float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     # the operator serves graphs and transforms alone: its first call imports torch's compiler, which takes seconds
-    of = _compute_inverse if are_known(k, r2) else _radial_inverse
+    of = _compute_inverse if are_concrete(k, r2) else _radial_inverse
     return of(name, k, end, r2)
 
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.export import atan2, plus
-from camtorch.evaluate.tensors import may_look_at
+from camtorch.evaluate.tensors import may_branch_on
 
 # Below these the power series is used. Its first dropped term is below 1e-21, and above them the closed form still has
 # a first derivative accurate to 1e-13 of the function's own scale.
@@ -43,7 +43,7 @@ def _blend(
 
     `in_near` and `in_far`: harmless inputs where the other branch counts; None leaves the plane.
     """
-    looks = may_look_at(small, *planes) and small.numel() > _MANY
+    looks = may_branch_on(small, *planes) and small.numel() > _MANY
     places = small.nonzero(as_tuple=True) if looks else ()
     if looks and not len(places[0]):
         return far(*planes)

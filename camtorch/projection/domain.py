@@ -12,7 +12,7 @@ from torch import Tensor
 
 from camtorch.evaluate.export import of_points, plus
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.tensors import may_look_at
+from camtorch.evaluate.tensors import may_branch_on
 from camtorch.native.structs import AZIMUTHS, MOST_RADII
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
 from camtorch.projection.fold import Extent, azimuth, limits_and_extent
@@ -185,7 +185,7 @@ class Domain:
         inside = self.safe_radius_sq - t
         if self.is_circular:
             return inside
-        if may_look_at(inside):  # few points are as far out
+        if may_branch_on(inside):  # few points are as far out
             places = (~(inside > 0)).nonzero(as_tuple=True)
             if len(camera := places[0]):
                 a, b = a[places], b[places]

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.nn.utils import parametrize
 
-from camtorch.evaluate.door import is_constant, is_native, way_of
+from camtorch.evaluate.door import in_memory, is_constant, is_recorded, way_of
 from camtorch.evaluate.export import portable_export, with_values
 from camtorch.evaluate.kept import Kept, same
 from camtorch.evaluate.tensors import are_free
@@ -149,7 +149,7 @@ class _Native(Function):
             return (None,) * 5
         rows, intrinsics, distortion, *kept = ctx.saved_tensors
         wanted, cameras = ctx.needs_input_grad, ctx.cameras
-        if torch.is_grad_enabled() or not is_native(by_planes):
+        if torch.is_grad_enabled() or not in_memory(by_planes) or is_recorded():
             # use the formula, with a graph of its own
             inputs, options = (rows, intrinsics, distortion), {"create_graph": True, "materialize_grads": True}
             leaves = [t for t, needed in zip(inputs, wanted[:3], strict=True) if needed]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from camtorch.evaluate.recorded import as_kept, order_of, positive, power_of_two, to_planes, without_keeping
-from camtorch.evaluate.tensors import may_look_at
+from camtorch.evaluate.tensors import may_branch_on
 from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection import native_calls
 from camtorch.projection.camera_like import CameraLike
@@ -55,7 +55,7 @@ def _formula(
 ) -> tuple[Tensor, Tensor]:
     """Return pixels (2, C, N) for points (C, N, 3), and valid (C, N); see `Direction.formula`."""
     traced = Traced.of(model, intrinsics, distortion, cameras)
-    looks = may_look_at(points, intrinsics, distortion)
+    looks = may_branch_on(points, intrinsics, distortion)
 
     def evaluate(
         x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from camtorch.evaluate.export import times
 from camtorch.evaluate.recorded import order_of, positive, to_planes, without_keeping
-from camtorch.evaluate.tensors import may_look_at
+from camtorch.evaluate.tensors import may_branch_on
 from camtorch.optics.charts import Planes2
 from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
@@ -79,7 +79,7 @@ def _first_image(domain: Domain, u: Tensor, v: Tensor) -> tuple[Found, Tensor]:
     """Return the points that the stages after the first one send to (u, v), and a margin of the image's circle."""
     rest = present(domain.lens.rest, "a later stage")
     within = domain.image_circle_sq - torch.addcmul(u * u, v, v)
-    mask = to_mask(within, may_look_at(u))
+    mask = to_mask(within, may_branch_on(u))
     u, v = replace(mask, u, 0.0), replace(mask, v, 0.0)
     return _newton(rest, u, v, *rest.start(u, v)), within
 
@@ -90,7 +90,7 @@ def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
     radial, table = present(domain.lens.radial, "a radial factor"), present(domain.inverse, "a table")
     possible = times(table.most2, 1 + 8 * eps) - r2
     # points beyond the fold would never converge
-    r2 = torch.minimum(replace(to_mask(possible, may_look_at(r2)), r2, 0.0), table.most2)
+    r2 = torch.minimum(replace(to_mask(possible, may_branch_on(r2)), r2, 0.0), table.most2)
     scale, converged = solve(radial, table, r2)
     # a ray's rounding must not carry it across the fold
     inside = times(domain.safe_radius_sq, 1 - 32 * eps) - r2 * scale * scale
@@ -98,7 +98,7 @@ def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
 
 
 def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Found:
-    short2, converged, looks = short(u.dtype) ** 2, None, may_look_at(u)
+    short2, converged, looks = short(u.dtype) ** 2, None, may_branch_on(u)
     for _ in range(MOST_STEPS):
         at = lens.at(a, b)
         x, y = at.value
@@ -153,7 +153,7 @@ def _formula(
 ) -> tuple[Tensor, Tensor]:
     """Return rays (3, C, N) for pixels (C, N, 2), and valid (C, N); see `Direction.formula`."""
     traced = Traced.of(model, intrinsics, distortion, cameras)
-    domain, looks = traced.domain, may_look_at(pixels, intrinsics, distortion)
+    domain, looks = traced.domain, may_branch_on(pixels, intrinsics, distortion)
     order = order_of(order, pixels, intrinsics, distortion)
     u, v = to_planes(pixels)
     # the solution has no graph; `attach` gives it derivatives

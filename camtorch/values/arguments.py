@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch.evaluate.door import may_look
+from camtorch.evaluate.door import is_cheap_to_read
 from camtorch.evaluate.tensors import is_kept, is_predicted, known_false, row_of
 
 Numbers: TypeAlias = Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]
@@ -312,7 +312,7 @@ def check_path(path: Any, owner: str) -> None:
 
 def check_boxes(boxes: Tensor, name: str, owner: str) -> None:
     """Raise a ValueError if plain boxes (..., 4) have x2 < x1 or y2 < y1, as boxes x, y, width, height mostly do."""
-    if not may_look(boxes) or boxes.requires_grad:
+    if not is_cheap_to_read(boxes) or boxes.requires_grad:
         return
     wide = boxes if boxes.dtype.is_floating_point else boxes.double()
     # rounding may turn a box without extent by so much
@@ -328,7 +328,7 @@ def check_boxes(boxes: Tensor, name: str, owner: str) -> None:
 
 def check_radians(vectors: Tensor, name: str, owner: str) -> None:
     """Raise a ValueError if plain rotation vectors (..., 3) have more than two turns, the most that anybody uses."""
-    if not may_look(vectors) or is_kept(vectors) or is_predicted(vectors):
+    if not is_cheap_to_read(vectors) or is_kept(vectors) or is_predicted(vectors):
         return
     if bool((vectors.square().sum(-1) > (4 * math.pi) ** 2 * (1 + 1e-6)).any()):
         longest = torch.linalg.vector_norm(vectors.double(), dim=-1).nan_to_num(0.0).amax().item()

@@ -13,7 +13,7 @@ from torch import Tensor
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import opaque
 from camtorch.evaluate.door import in_transform, keeps_graph
-from camtorch.evaluate.tensors import are_known, are_plain, is_unknown
+from camtorch.evaluate.tensors import are_concrete, are_plain, is_unknown
 from camtorch.native.sampler import maker
 from camtorch.optics.radial_inverse import WITHOUT_FLOAT64
 from camtorch.poses.rotations import transposed
@@ -100,7 +100,7 @@ class UncheckedWarp(Warp):
 
     def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[ImageEdit] | None:
         """Return the way of each row, or one for all; None to sample as any `Warp` does."""
-        if not (self.antialias is None and smooth and route == "kept" and are_known(self.target.intrinsics)):
+        if not (self.antialias is None and smooth and route == "kept" and are_concrete(self.target.intrinsics)):
             return None
         if self._halvings is None:
             known = self.host or self  # the warp on the CPU, whose values need no wait
@@ -182,7 +182,7 @@ class AffineWarp(UncheckedWarp):
         self.register_buffer("matrix", given.to(device, dtype), persistent=False)
         self.batch_shape: torch.Size = broadcast_shapes(self.batch_shape, given.shape[:-2])
         # the way depends on numbers on the CPU alone: it is the same on every device, and waits for none
-        self._numbers: list[Rows] = given.reshape(-1, 2, 3).tolist() if given is matrix and are_known(given) else []
+        self._numbers: list[Rows] = given.reshape(-1, 2, 3).tolist() if given is matrix and are_concrete(given) else []
         if not isinstance(matrix, Tensor):
             self._numbers = [matrix]
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
-from camtorch.evaluate.door import is_eager, keeps_graph, may_look
+from camtorch.evaluate.door import is_cheap_to_read, is_eager, keeps_graph
 from camtorch.evaluate.tensors import are_plain, is_unknown
 from camtorch.native import sampler
 from camtorch.native.library import native_available
@@ -165,7 +165,7 @@ def pixels_of_rows(target: Camera, rows: range) -> Tensor:
 
 def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
     """Return pixels (..., 2) of an image as positions for `grid_sample`; without a graph, `seen` is overwritten."""
-    if may_look(seen) and are_plain(seen):
+    if is_cheap_to_read(seen) and are_plain(seen):
         for plane, side in zip(seen.unbind(-1), size[::-1], strict=True):
             plane.mul_(2 / side).add_(1 / side - 1)
         seen.clamp_(-FAR, FAR)

@@ -10,7 +10,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
 from camtorch.evaluate.door import in_transform, is_eager
-from camtorch.evaluate.tensors import are_known, are_plain
+from camtorch.evaluate.tensors import are_concrete, are_plain
 from camtorch.native import sampler
 from camtorch.native.library import native_available, warn_if_missing
 from camtorch.warp.options import PADDINGS, Mode, PaddingMode
@@ -93,7 +93,7 @@ class _WithForwardMode(torch.autograd.Function):
 
     @staticmethod
     def forward(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode) -> Tensor:
-        if images.is_cpu and are_known(images, grid):
+        if images.is_cpu and are_concrete(images, grid):
             return _on_cpu(images.detach(), grid.detach(), mode, padding_mode)  # native code takes no graph
         return _grid_sample(images, grid, mode, padding_mode)
 

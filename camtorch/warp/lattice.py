@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from camtorch.evaluate.devices import sent
-from camtorch.evaluate.door import is_eager, may_look
+from camtorch.evaluate.door import is_cheap_to_read, is_eager
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import known_true
 from camtorch.native import sampler
@@ -170,7 +170,7 @@ def _pixel_by_pixel(
     (height, width), (_, n, m) = size, cells.shape
     quintic = cells == CELL_QUINTIC
     all_are = known_true(quintic)
-    some_are = all_are or (may_look(quintic) and bool(quintic.any()))
+    some_are = all_are or (is_cheap_to_read(quintic) and bool(quintic.any()))
     planes = interpolated(nodes if all_are else nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
     if some_are and not all_are:
         wide = quintic.repeat_interleave(STEP, 1).repeat_interleave(STEP, 2).unsqueeze(1)

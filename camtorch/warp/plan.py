@@ -167,7 +167,7 @@ class CameraPair(GeometryModule):
         if host is None or is_unknown(self.target.intrinsics):
             return None
         entry = host.entry(self.tensors, ())
-        return None if entry is None else entry[2]
+        return None if entry is None else entry.result
 
     def follow_host(self, host: CameraPair) -> Self:
         """Have a warp like this one, on the CPU, find the positions while the cameras stay; return this warp."""

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch.evaluate.door import converted, in_transform, is_eager, may_look
+from camtorch.evaluate.door import converted, in_transform, is_cheap_to_read, is_eager
 from camtorch.evaluate.tensors import are_plain
 from camtorch.native import memory, sampler
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, wide_dtype, widen
@@ -193,7 +193,7 @@ def _one_piece(images: Tensor, grid: Tensor, where: PixelPositions, levels: Pyra
         # a pixel that covers n source pixels takes the mean of about as many
         level = where.scale.clamp(min=1).log2().unsqueeze(1)
         last = min(levels.images.shape[-2:]).bit_length() - 1
-        for n in range(min(int(level.amax().ceil()) if may_look(level) else _TRACED_LEVELS, last)):
+        for n in range(min(int(level.amax().ceil()) if is_cheap_to_read(level) else _TRACED_LEVELS, last)):
             levels = levels.half
             smaller = sample(levels.images, where.grid, mode, beyond)
             share = (level - n).clamp(0, 1).to(result)
