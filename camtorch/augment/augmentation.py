@@ -19,7 +19,7 @@ from camtorch.augment.devices import Elsewhere, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
 from camtorch.augment.filling import enough, filled, scaled
 from camtorch.augment.matrices import Guess
-from camtorch.augment.ranges import Range, draw_numbers, rows_of
+from camtorch.augment.ranges import Draw, Range, draw_numbers, rows_of
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
@@ -155,9 +155,7 @@ class Augmentation(SampleTransform):
             for name, value in numbers.items()
         }
 
-    def _draw_numbers(
-        self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None
-    ) -> dict[str, Any]:
+    def _draw_numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> Draw:
         """Return a draw as lists, arrays or tensors; see `ranges.py`."""
         return draw_numbers(self.ranges, count, p, same_on_batch, generator)
 
@@ -195,7 +193,7 @@ class Augmentation(SampleTransform):
             raise ValueError(f"{self._name}: camera must be given; got {before}. Please {how}. {GUESS_CAMERA}")
         return self._change_on_host(one_or_batch(before), self._as_numbers(draw))
 
-    def _change_on_host(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
+    def _change_on_host(self, camera: Camera, draw: Draw) -> Change:
         """Return the change of a draw, computed on the CPU also for fixed cameras elsewhere, if the draw is there."""
         host = camera if camera.intrinsics.is_cpu else self._on_host(camera)
         if host is camera or not all(getattr(value, "is_cpu", True) for value in draw.values()):
@@ -214,7 +212,7 @@ class Augmentation(SampleTransform):
         revisions = [getattr(state.get("_calls"), "revision", None) for state in states]  # with public attributes
         return *revisions, str([[state.get(name) for name in ("options", "ranges", "image_size")] for state in states])
 
-    def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
+    def _change(self, camera: Camera, draw: Draw) -> Change:
         """Return the change of a draw of any form."""
         if 0 < self.p < 1 and self.image_size not in (None, camera.image_size):
             raise ValueError(
@@ -231,7 +229,7 @@ class Augmentation(SampleTransform):
             return Change(count, [self._part(camera, draw)], gate=gate)
         return by_models(count, camera, lambda rows, source: self._part(source, rows_of(draw, rows)), gate)
 
-    def _change_of_some(self, camera: Camera, draw: Mapping[str, Any], chosen: Sequence[bool]) -> Change:
+    def _change_of_some(self, camera: Camera, draw: Draw, chosen: Sequence[bool]) -> Change:
         """Return the change that moves only the chosen samples."""
         count, parts, camera = len(chosen), [], one_or_batch(camera)
         for rows, group in camera.groups if isinstance(camera, Mixed) else [(list(range(count)), camera)]:
@@ -252,7 +250,7 @@ class Augmentation(SampleTransform):
             return f"be edits after {' and '.join(sorted(colours))}, which another lens would show"
         return None
 
-    def _as_numbers(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
+    def _as_numbers(self, draw: Mapping[str, Tensor]) -> Draw:
         """Check a draw that is given, and return it as arrays, or as tensors if numbers may not be read."""
         as_mapping(draw, "draw", self._name, "what draw() returns")
         sizes = {**{name: interval.size for name, interval in self.ranges.items()}, **dict.fromkeys(self.crops, 4)}
@@ -272,7 +270,7 @@ class Augmentation(SampleTransform):
                 raise ValueError(f"{self._name}: draw[{name!r}] must be finite; got {value.tolist()}")
         return values
 
-    def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
+    def _part(self, source: Camera, draw: Draw) -> Part:
         return self._part_by_torch(source, self._values_for(source, draw))
 
     def _part_by_torch(self, source: Camera, values: Mapping[str, Any]) -> Part:
@@ -287,7 +285,7 @@ class Augmentation(SampleTransform):
         """Return the part from a source to a target; `values` may change images in more ways, such as their light."""
         return Part(source, Warp(source, target, rotation, **self._warp_options))
 
-    def _values_for(self, source: Camera, draw: Mapping[str, Any]) -> dict[str, Any]:
+    def _values_for(self, source: Camera, draw: Draw) -> dict[str, Any]:
         """Return drawn values, (*B,) or (*B, size).
 
         If one camera serves all samples and all draws are equal, the dim *B is left out: one warp serves all.
@@ -453,7 +451,7 @@ class Augmentation(SampleTransform):
         moved.pop(PLACE, None)  # what comes back is no crop
         return moved
 
-    def _with_labels(self, draw: Mapping[str, Any], rows: Callable[[], Named]) -> Mapping[str, Any]:
+    def _with_labels(self, draw: Draw, rows: Callable[[], Named]) -> Draw:
         """Add to a draw the boxes that it needs of a sample: those named `boxes`, or the first of that kind."""
         if not self.crops:
             return draw

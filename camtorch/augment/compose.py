@@ -15,7 +15,7 @@ from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.change import Change, check_sizes
 from camtorch.augment.edits import Edit, change_by
 from camtorch.augment.landmarks import Mirroring
-from camtorch.augment.ranges import Range, draw_numbers
+from camtorch.augment.ranges import Draw, Range, draw_numbers
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import as_mapping
 
@@ -143,10 +143,8 @@ class Compose(Augmentation):
         """The augmentations in their order."""
         return cast("list[Augmentation]", list(self.augmentations))
 
-    def _draw_numbers(
-        self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None
-    ) -> dict[str, Any]:
-        values = draw_numbers({}, count, p, same_on_batch, generator)
+    def _draw_numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> Draw:
+        values = {**draw_numbers({}, count, p, same_on_batch, generator)}
         for i, part in enumerate(self.parts):
             drawn = part._draw_numbers(count, part.p, same_on_batch or part.same_on_batch, generator)
             values |= {f"{i}.{name}": value for name, value in drawn.items()}
@@ -161,10 +159,10 @@ class Compose(Augmentation):
         for part in self.parts:
             part.tell_of_empty_images(camera)
 
-    def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
+    def _change(self, camera: Camera, draw: Draw) -> Change:
         parts = self.parts
         total: Change | None = None  # of the parts so far; camera: that after them
-        edits: list[tuple[Edit, Mapping[str, Any]]] = []
+        edits: list[tuple[Edit, Draw]] = []
         for i, part in enumerate(parts):
             part_draw = {name: draw[f"{i}.{name}"] for name in ("apply", *part.ranges, *part.crops)}
             part_draw["apply"] = (part_draw["apply"] > 0.5) & draw["apply"]

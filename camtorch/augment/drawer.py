@@ -18,7 +18,7 @@ from camtorch.augment.filling import enough, scaled, tell_of_narrow_images
 from camtorch.augment.jitter import jittered
 from camtorch.augment.native_draws import Start, Wanted
 from camtorch.augment.presets import REAL, as_like
-from camtorch.augment.ranges import Range, RangeLike, as_range
+from camtorch.augment.ranges import Draw, Range, RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_numbers, hold_numbers, known_false, with_derivatives_of
@@ -197,7 +197,7 @@ class CameraDrawer(Augmentation):
         kind: dict[str, Any] = {"dtype": example.dtype, "device": example.device}  # as_tensor makes float32 of floats
         return self.new_camera(source, {name: torch.as_tensor(value, **kind) for name, value in values.items()})
 
-    def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
+    def _part(self, source: Camera, draw: Draw) -> Part:
         values = self._values_for(source, draw)
         made = self._lazy_warp(source, values)
         if made is None:

@@ -15,7 +15,7 @@ from typing_extensions import Unpack
 from camtorch.augment.augmentation import Augmentation, EditOptions, FlipOptions
 from camtorch.augment.change import Change, Part, by_models
 from camtorch.augment.landmarks import Mirroring, TableLike
-from camtorch.augment.ranges import Range, as_range, rows_of
+from camtorch.augment.ranges import Draw, Range, as_range, rows_of
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited, quarter_turns
 from camtorch.evaluate.tensors import known_false, known_true
@@ -70,10 +70,10 @@ class Edit(Augmentation):
         nothing = {n: torch.full(() if r.size is None else (r.size,), r.low).double() for n, r in self.ranges.items()}
         return self.edit(size, nothing)[1]
 
-    def _change(self, camera: Camera, draw: Mapping[str, Any]) -> Change:
+    def _change(self, camera: Camera, draw: Draw) -> Change:
         return change_by([(self, draw)], camera, self._warp_options)
 
-    def map_of(self, draw: Mapping[str, Any], size: tuple[int, int]) -> tuple[Map | None, tuple[int, int]]:
+    def map_of(self, draw: Draw, size: tuple[int, int]) -> tuple[Map | None, tuple[int, int]]:
         """Return the map of a draw for images of a size (None if it never applies), and the new size."""
         applied = torch.as_tensor(draw["apply"])
         values = {n: torch.as_tensor(value, dtype=torch.float64) for n, value in draw.items() if n != "apply"}
@@ -93,7 +93,7 @@ class Edit(Augmentation):
         return torch.where(applied[:, None, None].to(matrix.device), matrix, still), new
 
 
-def change_by(edits: Sequence[tuple[Edit, Mapping[str, Any]]], camera: Camera, options: Options) -> Change:
+def change_by(edits: Sequence[tuple[Edit, Draw]], camera: Camera, options: Options) -> Change:
     """Return the change of `camera`'s images by edits and their draws, in order; `options` are those of warps."""
 
     def part(rows: list[int] | None, source: Camera) -> Part:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from camtorch.augment.change import Part
 from camtorch.augment.drawer import Auto, CameraDrawer, LensOptions
 from camtorch.augment.fields import Named
 from camtorch.augment.presets import PresetName
-from camtorch.augment.ranges import RangeLike, as_range
+from camtorch.augment.ranges import Draw, RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.warp.shifted import ShiftedWarp
 
@@ -138,7 +138,7 @@ class RandomMount(CameraDrawer):
         for name, each in zip(_SHIFTS, shift, strict=True):
             self.ranges[name] = as_range(each, "shift", self._name)
 
-    def _with_labels(self, draw: Mapping[str, Any], rows: Callable[[], Named]) -> Mapping[str, Any]:
+    def _with_labels(self, draw: Draw, rows: Callable[[], Named]) -> Draw:
         draw = super()._with_labels(draw, rows) if self.crops else draw
         if _SHIFTS[0] not in self.ranges:
             return draw
@@ -152,7 +152,7 @@ class RandomMount(CameraDrawer):
             f"against far ones; got {', '.join(named)}. Without shift, yaw, pitch, roll and zoom are exact"
         )
 
-    def _as_numbers(self, draw: Mapping[str, Tensor]) -> Mapping[str, Any]:
+    def _as_numbers(self, draw: Mapping[str, Tensor]) -> Draw:
         return {**super()._as_numbers(draw), **{key: draw[key] for key in _DEPTHS if key in draw}}
 
     def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
@@ -160,7 +160,7 @@ class RandomMount(CameraDrawer):
             return f"have no shift, which needs depth: {name} goes before"
         return super()._chain_error(later, name)
 
-    def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
+    def _part(self, source: Camera, draw: Draw) -> Part:
         if _SHIFTS[0] not in self.ranges:
             return super()._part(source, draw)
         key = next((key for key in reversed(_DEPTHS) if key in draw), None)

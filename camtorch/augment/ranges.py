@@ -26,6 +26,8 @@ from camtorch.evaluate.door import is_eager
 from camtorch.values.arguments import as_number, shown, warn
 
 RangeLike = float | Sequence[float]
+Draw = Mapping[str, Any]
+"""A draw in any of its forms."""
 
 Spans = SimpleNamespace  # by that name pickles of 0.4.0 have one that nothing reads
 _RADIANS = 0.8  # 45 degrees: a range of degrees within it is more likely in radians
@@ -95,7 +97,7 @@ def as_range(
 
 def draw_numbers(
     ranges: Mapping[str, Range], count: int, p: float, same: bool, generator: torch.Generator | None
-) -> dict[str, Any]:
+) -> Draw:
     """Return a draw in the form that takes the least time: `apply`, true with probability p, and all ranges."""
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
@@ -128,6 +130,6 @@ def draw_numbers(
     return values if rows == count else rows_of(values, [0] * count)
 
 
-def rows_of(draw: Mapping[str, Any], rows: list[int] | None) -> dict[str, Any]:
+def rows_of(draw: Draw, rows: list[int] | None) -> Draw:
     """Return these rows of a draw of arrays or tensors; None: all."""
     return {name: value if rows is None else value[rows] for name, value in draw.items()}

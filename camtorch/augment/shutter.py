@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.change import Part
-from camtorch.augment.ranges import RangeLike, as_range
+from camtorch.augment.ranges import Draw, RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import one_of
 from camtorch.warp.shutter import DIRECTIONS, Direction, RollingShutter, ShutterWarp
@@ -52,7 +52,7 @@ class RandomShutter(Augmentation):
     def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
         return f"move no rows of a rolling shutter: {name} goes last" if later else None
 
-    def _part(self, source: Camera, draw: Mapping[str, Any]) -> Part:
+    def _part(self, source: Camera, draw: Draw) -> Part:
         values = self._as_tensors(source, self._values_for(source, draw))
         shutter = RollingShutter(values["readout"], torch.deg2rad(values["rates"]), direction=self.direction)
         return Part(source, ShutterWarp(source, source, target_shutter=shutter, **self._warp_options))

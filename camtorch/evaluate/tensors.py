@@ -11,7 +11,7 @@ transform of torch.func holds, of one beside such a transform, of a dual one, an
     may_branch_on       yes    yes     no       no           no    no      as `is_eager`, of some values
     are_free            yes    no      no       no           no    no      and autograd does not record
     are_numbers         yes    no      no       no           no    no      and no tensor is of a subclass
-    are_plain           yes    no      no       no           no    no      on the CPU, and no derivative, even under `no_grad`
+    are_plain           yes    no      no       no           no    no      no derivative, even under `no_grad`
     in_graph            no     yes     yes      no           yes   yes     derivatives pass, or it is traced
 """
 
