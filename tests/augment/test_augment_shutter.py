@@ -69,8 +69,9 @@ def test_a_chain_moves_images_once_and_ends_with_its_shutter():
     second = rolls(keypoints=plain["keypoints"], image=image.flip(-1), camera=plain["camera"], draw=own)
     assert (once["keypoints"] - second["keypoints"]).abs().max() < 1e-3
     assert (once["image"] - second["image"] * plain["image"]).abs().max() < 2e-3
-    with pytest.raises(ValueError, match="RandomShutter goes last"):
-        ct.augment.Compose([rolls, first[0]], camera=source)
+    for part, name in ((rolls, "RandomShutter"), (ct.augment.Compose([rolls]), "Compose")):
+        with pytest.raises(ValueError, match=f"{name} goes last; got {name} at place 0"):
+            ct.augment.Compose([part, first[0]], camera=source)
 
 
 @pytest.mark.parametrize("fov", [60, 120, 170])

@@ -278,6 +278,21 @@ def test_images_that_shrink_are_smoothed_before_and_after_a_lens(side):
                 assert seen.std() > 0.2 if antialias is False else (seen - 0.5).abs().max() < 0.1
 
 
+def test_only_edits_choose_what_to_antialias():
+    image, lens = torch.rand(1, 3, 240, 320), ct.Pinhole([200.0, 200, 159.5, 119.5], image_size=(240, 320))
+    still = {"yaw": None, "pitch": None, "roll": None, "zoom": (0.3, 0.3), "min_filled": 0, "camera": lens}
+    mounts = [A.RandomMount(**still, antialias=antialias) for antialias in (None, False)]
+    assert torch.equal(*(mount(image=image)["image"] for mount in mounts))
+    made = A.Resize((60, 80))(image=image)["image"]
+    plain = A.Resize((60, 80), antialias=False)
+    for flag in ({"antialias": None}, {"_warps_decide": True}):  # of states before 0.5
+        kept = A.Resize.__new__(A.Resize, (60, 80))
+        kept.__setstate__({**vars(plain), "options": dict(plain.options), **flag})
+        assert kept.antialias is None
+        assert torch.equal(kept(image=image)["image"], made)
+    assert not torch.equal(plain(image=image)["image"], made)
+
+
 def test_a_chain_shows_what_its_last_camera_sees():
     lens = camera(ct.Fisheye624, torch.float32, (96, 128))
     image = scene(lens.rays()[0]).expand(4, -1, -1, -1)
