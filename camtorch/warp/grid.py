@@ -282,13 +282,14 @@ def _found_by_torch(
     positions, mapped = (t[:, 0] for t in cameras.exact(pixels))
     count = math.prod(shape)
     nodes = positions[:, :count].movedim(-1, 1).contiguous().unflatten(2, shape)
-    mapped, rim = mapped[:, :count].unflatten(1, shape), mapped[:, count:]
     if looks_further:
-        is_smooth = bool(mapped.all() and rim.all()) and are_smooth(nodes, source_size, tolerance)
-        nodes, mapped = (t[..., 1:-1, 1:-1].contiguous() for t in (nodes, mapped))
+        is_smooth = bool(mapped.all()) and are_smooth(nodes, source_size, tolerance)
+        nodes = nodes[:, :, 1:-1, 1:-1].contiguous()
         if is_smooth:
             cells = torch.full((len(nodes), n, m), CELL_QUINTIC, dtype=torch.int32, device=nodes.device)
             return Lattice(nodes, cells, nodes.new_empty(2, 0, STEP, STEP), size)
+    mapped, rim = mapped[:, :count].unflatten(1, shape), mapped[:, count:]
+    mapped = mapped[:, 1:-1, 1:-1].contiguous() if looks_further else mapped
     narrow, find = nodes.float(), sampler.classify if native_available() else classify
     cells = find(narrow, mapped, rim, size, *limits)
     settle(cameras.exact, first, cells, narrow, mapped, *limits)

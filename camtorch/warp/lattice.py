@@ -169,10 +169,11 @@ def _pixel_by_pixel(
     """
     (height, width), (_, n, m) = size, cells.shape
     quintic = cells == CELL_QUINTIC
-    all_are = known_true(quintic)
-    some_are = all_are or (is_cheap_to_read(quintic) and bool(quintic.any()))
-    planes = interpolated(nodes if all_are else nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
-    if some_are and not all_are:
+    if known_true(quintic):
+        planes = interpolated(nodes, n, m)[:, :, :height, :width]
+        return planes.movedim(1, -1), torch.ones_like(planes[:, 0], dtype=torch.bool)
+    planes = interpolated(nodes[:, :, 1:-1, 1:-1], n, m)  # (B, 2, 8 n, 8 m)
+    if is_cheap_to_read(quintic) and bool(quintic.any()):
         wide = quintic.repeat_interleave(STEP, 1).repeat_interleave(STEP, 2).unsqueeze(1)
         planes = torch.where(wide, interpolated(nodes, n, m), planes)
     blocks = planes.unflatten(2, (n, STEP)).unflatten(4, (m, STEP))

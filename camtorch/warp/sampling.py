@@ -90,8 +90,7 @@ def _within_memory(images: Tensor, where: PixelPositions, how: Sampler, kept: di
     if how.mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:
         return _nearest_integers(images, where, how)
     where = where._replace(grid=converted(where.grid, wide_dtype(dtype)))
-    plain = is_eager(images, where.grid) and are_plain(images, where.grid)
-    if not plain or dtype == wide_dtype(dtype):
+    if dtype == wide_dtype(dtype) or not (is_eager(images, where.grid) and are_plain(images, where.grid)):
         levels = _levels(kept, 0, widen(images))
         return narrow(_one_piece(levels.images, where.grid, where, levels, how), dtype)
     large = math.prod(images.shape[1:]) > _LARGE
