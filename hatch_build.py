@@ -1,4 +1,4 @@
-"""What hatchling does beside copying files: it compiles the sampler for a wheel, if there is a C compiler.
+"""What hatchling does beside copying files: it compiles the native library for a wheel, if there is a C compiler.
 
 Where there is none, or it fails, the wheel is pure Python and holds the reason, which `camtorch --version` tells:
 installers show what a build says only when asked to (`pip install -v`). scikit-build-core can do the same, and brings
@@ -56,7 +56,7 @@ class NativeSampler(BuildHookInterface):
             reason.unlink(missing_ok=True)
         except (building.BuildError, OSError) as error:
             why = _line(str(error))
-            self.app.display_warning(f"camtorch is installed without its native sampler: {why}")
+            self.app.display_warning(f"camtorch is installed without its compiled library: {why}")
             with suppress(PermissionError):  # on Windows, where a process has it loaded
                 library.unlink(missing_ok=True)
             reason.write_text(why + "\n", "utf-8")

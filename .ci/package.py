@@ -1,6 +1,6 @@
 """Builds what is published, and uses it away from the checkout, as one who installs it.
 
-The archive of sources, and what pip makes of it: a wheel with the native sampler, where there is a C compiler, and one
+The archive of sources, and what pip makes of it: a wheel with the compiled library, where there is a compiler, and one
 without. Each is installed into an environment that has what its metadata ask for and nothing else, where `installed.py`
 does what camtorch is for. The libraries come by links from the environment that this runs in, which has them.
 
@@ -74,7 +74,7 @@ def main(folder: Path, work: Path) -> None:
     check_archive(archive)
     print(f"{archive.name}: {archive.stat().st_size / 1e6:.2f} MB")
     if "native" not in built:
-        print("no C compiler is here, so no wheel has a sampler")
+        print("no C compiler is here, so no wheel has a library")
     for kind, wheel in built.items():
         needs = wheels.check(wheel)
         python = environment(work / kind, wheel)

@@ -1,1 +1,1 @@
-"""Native code: the sampler of images and the geometry of cameras, how they are built and found."""
+"""Native code: the sampling of images and the geometry of cameras, how they are built and found."""

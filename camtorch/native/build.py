@@ -1,10 +1,10 @@
-"""Compile the sampler: `python -m camtorch.native.build`. It needs a C compiler and no package, not even camtorch.
+"""Compile the library: `python -m camtorch.native.build`. It needs a C compiler and no package, not even camtorch.
 
 Each C file is compiled once for each kind of CPU, `dispatch.c` once; one shared library of all has no symbol of Python
-or torch, so it fits every version of them. It never has `-march=native`, as it may move to another machine, nor
-with `-ffast-math`, which links code that changes how the whole process rounds. A unit is compiled again if its text,
-without comments, that of its headers, the options or the compiler have changed; `CAMTORCH_VARIANTS=baseline` compiles
-for one kind of CPU, to try out a change.
+or torch, so it fits every version of them. It is compiled neither with `-march=native`, as it may move to
+another machine, nor with `-ffast-math`, which links code that changes how the whole process rounds. A unit is compiled
+again if its text, without comments, that of its headers, the options or the compiler have changed;
+`CAMTORCH_VARIANTS=baseline` compiles for one kind of CPU, to try out a change.
 """
 
 from __future__ import annotations

@@ -14,8 +14,12 @@ from typing import Any, NamedTuple
 
 _HERE = Path(__file__).resolve().parent
 # types of fields, and of what calls take and return: in ctypes, and of their values
-_FIELDS = {"*": ("c_void_p", "int | None"), "int64_t": ("c_int64", "int"), "int32_t": ("c_int32", "int")}
-_FIELDS["double"] = "c_double", "float"
+_FIELDS = {
+    "*": ("c_void_p", "int | None"),
+    "int64_t": ("c_int64", "int"),
+    "int32_t": ("c_int32", "int"),
+    "double": ("c_double", "float"),
+}
 _GIVEN = {"int64_t": ("c_int64", "int"), "double*": ("c_void_p", "int"), "char*": ("c_char_p", "bytes")}
 _RESULTS = _GIVEN | {"int32_t": ("c_int32", "int"), "unsigned": ("c_uint32", "int"), "void": ("None", "None")}
 _DECLARED = re.compile(r"\benum\s*\{([^}]*)\}|typedef struct \{([^}]*)\}\s*(\w+);")

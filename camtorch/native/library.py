@@ -1,4 +1,4 @@
-"""The native library: which one is loaded, or why none is."""
+"""The compiled library: which one is loaded, or why none is."""
 
 from __future__ import annotations
 
@@ -87,7 +87,9 @@ def warn_if_missing() -> None:
 def loaded() -> Library:
     """Return the library, for calls that are made only if there is one."""
     if (found := library()) is None:
-        raise RuntimeError(f"camtorch: the native sampler must be there for compiled calls; got none: it is {state()}")
+        raise RuntimeError(
+            f"camtorch: the compiled library must be there for compiled calls; got none: it is {state()}"
+        )
     return found
 
 

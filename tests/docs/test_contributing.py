@@ -88,7 +88,7 @@ for line in sys.stdin.read().splitlines():
 
 @pytest.fixture(scope="module")
 def clone(tmp_path_factory):
-    """The repository as git knows it, with the native sampler if there is one."""
+    """The repository as git knows it, with the compiled library if there is one."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
     if listed.returncode:
         pytest.skip("this is no clone of the repository")

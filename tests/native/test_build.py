@@ -1,4 +1,4 @@
-"""The native sampler is built where there is a C compiler, found where it lies, and its absence has a reason."""
+"""The compiled library is built where there is a C compiler, found where it lies, and its absence has a reason."""
 
 import ctypes
 import os

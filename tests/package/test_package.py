@@ -1,4 +1,4 @@
-"""How a wheel is built: with the sampler and without. What is in it and what it does, `.ci/package.py` tries."""
+"""How a wheel is built: with the library and without. What is in it and what it does, `.ci/package.py` tries."""
 
 import os
 import shutil
@@ -35,7 +35,7 @@ def hatchling(tmp_path_factory):
 
 @pytest.fixture
 def checkout(tmp_path):
-    """A copy of what a wheel is made of, with a sampler that takes no time to compile, and an older library in it."""
+    """A copy of what a wheel is made of, with a library that takes no time to compile, and an older library in it."""
     folder = tmp_path / "checkout"
     ignore = shutil.ignore_patterns("_sampler.*", "_objects", "__pycache__", "*.[ch]")
     shutil.copytree(ROOT / "camtorch", folder / "camtorch", ignore=ignore)
@@ -67,7 +67,7 @@ def held(folder):
 )
 def test_without_a_sampler_the_wheel_is_for_all_and_says_why(checkout, tmp_path, hatchling, environment, reason):
     lines = hatchling(checkout, "-t", "wheel", "-d", tmp_path, **environment).splitlines()
-    (line,) = (line for line in lines if "without its native sampler: " in line)
+    (line,) = (line for line in lines if "without its compiled library: " in line)
     name, found = held(tmp_path)
     assert name == "py3-none-any.whl"
     assert list(found) == [REASON]

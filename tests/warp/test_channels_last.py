@@ -16,7 +16,7 @@ from camtorch.native.library import native_available
 
 SIZE = (50, 70)
 camera = partial(fisheye, size=SIZE, focal=0.7)
-needs_native = pytest.mark.skipif(not native_available(), reason="there is no native sampler")
+needs_native = pytest.mark.skipif(not native_available(), reason="there is no compiled library")
 
 
 def colours(channels=3, dtype=np.uint8, size=SIZE):
