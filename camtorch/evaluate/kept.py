@@ -16,7 +16,7 @@ T = TypeVar("T")
 class Entry(NamedTuple):
     """A result that is kept, and what it was computed from."""
 
-    options: tuple[Any, ...]
+    key: tuple[Any, ...]
     notes: list[Note]
     result: Any
 
@@ -36,11 +36,11 @@ class Kept:
     def __init__(self, capacity: int = 1) -> None:
         self.capacity = capacity
 
-    def __call__(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], T]) -> T:
-        """Return `compute()` without a graph, or its kept result; it depends on the tensors `inputs` and `options`."""
+    def __call__(self, inputs: Sequence[Tensor], key: tuple[Any, ...], compute: Callable[[], T]) -> T:
+        """Return `compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `key`."""
         if inputs and not is_eager(*inputs) and not all(is_concrete(t) and not has_tangent(t) for t in inputs):
             return compute()
-        if (entry := self.entry(inputs, options)) is not None:
+        if (entry := self.entry(inputs, key)) is not None:
             found: T = entry.result
             self.result = found
             return found
@@ -49,23 +49,23 @@ class Kept:
         with torch.inference_mode(False), torch.no_grad():  # a graph cannot use tensors of inference mode
             notes = [note(t) for t in inputs]
             result = compute()
-        self._kept, self.result = [Entry(options, notes, result), *self._kept[: self.capacity - 1]], result
+        self._kept, self.result = [Entry(key, notes, result), *self._kept[: self.capacity - 1]], result
         return result
 
-    def entry(self, inputs: Sequence[Tensor], options: tuple[Any, ...]) -> Entry | None:
+    def entry(self, inputs: Sequence[Tensor], key: tuple[Any, ...]) -> Entry | None:
         """Return what is kept for inputs whose values may be read, or None."""
         known = self._kept
         for i, entry in enumerate(known):
-            if options == entry.options and all(map(same, inputs, entry.notes)):
+            if key == entry.key and all(map(same, inputs, entry.notes)):
                 if i:  # a new list, as another thread may be reading this one
                     self._kept = [entry, *known[:i], *known[i + 1 :]]
                 return entry
         return None
 
-    def unless_learning(self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], T]) -> T:
+    def unless_learning(self, inputs: Sequence[Tensor], key: tuple[Any, ...], compute: Callable[[], T]) -> T:
         """Return `compute()` with its graph if an input learns, else as the call does."""
         learns = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-        return compute() if learns else self(inputs, options, compute)
+        return compute() if learns else self(inputs, key, compute)
 
     def renew(self, compute: Callable[[], T]) -> T:
         """Return `compute()`, which is the result from now on."""
@@ -76,12 +76,12 @@ class Kept:
         return result
 
     def copies(
-        self, inputs: Sequence[Tensor], options: tuple[Any, ...], compute: Callable[[], tuple[Tensor, ...]]
+        self, inputs: Sequence[Tensor], key: tuple[Any, ...], compute: Callable[[], tuple[Tensor, ...]]
     ) -> tuple[Tensor, ...]:
         """Return tensors that belong to the caller: copies of those kept, or new ones if an input learns."""
         if torch.is_grad_enabled() and any(map(in_graph, inputs)):
             return compute()
-        return tuple(t.clone() for t in self(inputs, options, compute))
+        return tuple(t.clone() for t in self(inputs, key, compute))
 
     def __getstate__(self) -> dict[str, Any]:
         return {"capacity": self.capacity}
