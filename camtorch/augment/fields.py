@@ -13,7 +13,7 @@ from torch import Tensor
 
 from camtorch.augment.change import Change
 from camtorch.augment.matrices import SHAPE, SIDES, check_matrix, matrix_hint, moved_matrix
-from camtorch.evaluate.tensors import known_false, known_true
+from camtorch.evaluate.tensors import known_some, known_true
 from camtorch.poses.rotations import are_rotations, check_rotation, is_right, rotation_matrix, rotation_vector
 from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians
 from camtorch.values.dtypes import widen
@@ -219,7 +219,7 @@ def _check_pose(value: Tensor, name: str, owner: str) -> None:
     if value.ndim == 2 and is_right(rotations):
         return
     wrong = ~are_rotations(rotations) & torch.isfinite(rotations).flatten(-2).all(-1)
-    if known_false(~wrong):
+    if known_some(wrong):
         check_rotation(rotations[wrong][:1], name, owner)
 
 
@@ -228,7 +228,7 @@ def _check_pitch_yaw(value: Tensor, name: str, owner: str) -> None:
         return
     # with room for the rounding of half precision
     beyond = value.abs() > value.new_tensor([math.pi / 2, math.pi]) * 1.01
-    if known_false(~beyond):
+    if known_some(beyond):
         pitch, yaw = value[beyond.any(-1)][0].tolist()
         raise ValueError(
             f"{owner}: {name} must be radians, pitch within pi / 2 and yaw within pi; got {pitch:.6g}, {yaw:.6g}. "
@@ -264,10 +264,10 @@ def _mask_sampler(options: Options, mask_fill: float) -> Sampler:
     return Sampler("nearest", "zeros", (mask_fill,))
 
 
-_MANY = 16  # dims: any number
+_MOST_DIMS = 16  # any number
 _DIRECTIONS = Field(
     dims=1,
-    most_dims=_MANY,
+    most_dims=_MOST_DIMS,
     ends=[(3,)],
     shape="(B, *N, 3) directions of the camera frame",
     move=_by(Change.rays),
@@ -343,7 +343,7 @@ KINDS = {
     ),
     "points": Field(
         dims=1,
-        most_dims=_MANY,
+        most_dims=_MOST_DIMS,
         ends=[(3,)],
         shape="(B, *N, 3) points of the camera frame",
         move=_by(Change.positions),
@@ -354,7 +354,7 @@ KINDS = {
     "directions": _DIRECTIONS,
     "pitch_yaw": Field(
         dims=1,
-        most_dims=_MANY,
+        most_dims=_MOST_DIMS,
         ends=[(2,)],
         shape="(B, *N, 2) pitch and yaw of a gaze in radians",
         move=_by(Change.rays, from_pitch_yaw, to_pitch_yaw),

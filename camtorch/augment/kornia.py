@@ -34,7 +34,7 @@ from camtorch.augment.sample import detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import kind
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.tensors import known_false
+from camtorch.evaluate.tensors import known_some
 from camtorch.models import Pinhole
 from camtorch.optics.radial_inverse import precise
 from camtorch.values.arguments import as_part, no_camera
@@ -150,7 +150,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
         if missing := [name for name in ("batch_prob", *ours) if name not in params]:
             raise ValueError(f"{type(self).__name__}: params must have {', '.join(missing)}; got none. Call it first")
         values = {"apply": self._gate(params), **{name: params[name] for name in ours}}
-        if self.augmentation.crops and any(known_false(~values[name].isnan()) for name in self.augmentation.crops):
+        if self.augmentation.crops and any(known_some(values[name].isnan()) for name in self.augmentation.crops):
             raise ValueError(
                 f"{type(self).__name__}: params must hold boxes, as kornia passes boxes after images; got none. Use "
                 "params = aug.forward_parameters(images.shape), then aug(images, params=with_boxes(params, boxes))"

@@ -14,7 +14,7 @@ from torch import Tensor
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.image_sizes import off_centre, warn_of_order, warn_of_size
 from camtorch.cameras.mixed import Mixed
-from camtorch.evaluate.tensors import known_false
+from camtorch.evaluate.tensors import known_false, known_some
 from camtorch.models import Pinhole
 from camtorch.values.arguments import check_degrees, first_time
 from camtorch.values.dtypes import widen
@@ -88,7 +88,7 @@ def check_matrix(value: Tensor, name: str, owner: str) -> None:
         as_wanted[..., row, column] |= matrix[..., row, column].abs() <= _SKEW * matrix[..., 0, 0]
     wrong = ~(torch.where(free, torch.isfinite(matrix), as_wanted).flatten(-2).all(-1))
     wrong = wrong | (matrix[..., 0, 0] <= 0) | (matrix[..., 1, 1] <= 0)
-    if known_false(~wrong):
+    if known_some(wrong):
         one = matrix.reshape(-1, *matrix.shape[-2:])[wrong.reshape(-1)][0].tolist()
         raise ValueError(
             f"{owner}: {name} must be {SHAPE}, with fx, fy above 0 and no skew; got {one}. Leave one unchanged with "

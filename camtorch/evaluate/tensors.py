@@ -32,6 +32,11 @@ def known_false(condition: Tensor) -> bool:
     return is_concrete(condition) and not bool(condition.all())
 
 
+def known_some(condition: Tensor) -> bool:
+    """Whether a condition is known to hold somewhere: a traced one is not checked."""
+    return is_concrete(condition) and bool(condition.any())
+
+
 def known_true(condition: Tensor) -> bool:
     """Whether a condition is known to hold everywhere: False if finding out would take more than a quick look."""
     return is_cheap_to_read(condition) and bool(condition.all())

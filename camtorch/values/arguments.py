@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from camtorch.evaluate.door import is_cheap_to_read
-from camtorch.evaluate.tensors import is_kept, is_predicted, known_false, row_of
+from camtorch.evaluate.tensors import is_kept, is_predicted, known_false, known_some, row_of
 
 Numbers: TypeAlias = Tensor | np.ndarray[Any, Any] | np.number[Any] | float | list[Any] | tuple[Any, ...]
 """Numbers as users pass them: a tensor, an array, a number, or lists of them."""
@@ -340,7 +340,7 @@ def check_radians(vectors: Tensor, name: str, owner: str) -> None:
 
 def check_angles(angles: Tensor, owner: str) -> None:
     """Raise a ValueError if angles exceed a turn, as degrees would; a network's predictions are not checked."""
-    if not is_predicted(angles) and known_false(~(angles.abs() > 2 * math.pi * (1 + 1e-6))):
+    if not is_predicted(angles) and known_some(angles.abs() > 2 * math.pi * (1 + 1e-6)):
         raise ValueError(
             f"{owner}: angles must be radians; got {float(angles.abs().max()):.4g}, which seems to be degrees. "
             "Use torch.deg2rad() or math.radians()"
