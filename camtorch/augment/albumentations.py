@@ -27,6 +27,7 @@ from camtorch.augment.names import kind_of
 from camtorch.augment.sample import Sample, detached
 from camtorch.augment.saving import as_plain, from_plain
 from camtorch.cameras.camera import Camera
+from camtorch.values.arguments import present
 
 _OWNER = "albumentations.Transform"
 _TARGETS = "image", "images", "mask", "masks", "bboxes", "keypoints"  # of pipelines
@@ -117,8 +118,7 @@ class Transform(FrontEnd, A.DualTransform):
             places[field], fields[field] = (name, target), _given(target, value, camera)
 
         def write(moved: Sample) -> Sample:
-            change = self.augmentation.last
-            assert change is not None  # set by the call that moved
+            change = present(self.augmentation.last, "the change of the call that moved")
             result = data | {name: moved[name] for name in ("camera", "crop_place") if name in moved}
             for field, (name, target) in places.items():
                 seen = moved.get(f"{field}_valid")

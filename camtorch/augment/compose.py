@@ -17,7 +17,7 @@ from camtorch.augment.edits import Edit, change_by
 from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.ranges import Draw, Range, draw_numbers
 from camtorch.cameras.camera import Camera
-from camtorch.values.arguments import as_mapping
+from camtorch.values.arguments import as_mapping, present
 
 T = TypeVar("T")
 
@@ -178,7 +178,7 @@ class Compose(Augmentation):
             total = step if total is None else total.then(step)
             (first, *others) = step.parts  # a camera of all samples stays single
             camera = step.target if others or first.rows is not None else first.target
-        assert total is not None
+        total = present(total, "a part")
         check_sizes((part.image_size for part in total.parts), self._name)
         return total.with_options(self.options)
 

@@ -16,16 +16,16 @@ from camtorch.evaluate.tensors import may_branch_on
 from camtorch.native.structs import AZIMUTHS, MOST_RADII
 from camtorch.optics.radial_inverse import RADII, InverseTable, first_loss, fold_of, precise, tabulate, within
 from camtorch.projection.fold import Extent, azimuth, limits_and_extent
-from camtorch.values.arguments import columns
+from camtorch.values.arguments import columns, present
 
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens
     from camtorch.optics.model_spec import Optics
 
-_AT_ONCE = 6  # cameras whose azimuths are followed together
-_STEPS = 129  # radii at which the bounds of stages after a radial one are taken
-_WIDER = 1.25  # times the edge of the radial stage, up to there
+_CAMERAS_AT_ONCE = 6  # whose azimuths are followed together
+_BOUND_RADII = 129  # at which the bounds of stages after a radial one are taken
+_FARTHEST_BOUND = 1.25  # times the edge of the radial stage, up to there
 # Stages after a radial one that change distances by less than a quarter, and so move points by less than that, are
 # inverted by Newton's method from anywhere: each step leaves at most 2/3 of the distance
 _LEAST_SLOPE = 0.75
@@ -77,7 +77,7 @@ class Domain:
     @cached_property
     def _followed(self) -> tuple[Tensor, Extent]:
         with torch.inference_mode(False), torch.no_grad():
-            parts = [limits_and_extent(self.optics, k) for k in self.k.split(_AT_ONCE)]
+            parts = [limits_and_extent(self.optics, k) for k in self.k.split(_CAMERAS_AT_ONCE)]
             limits2, extents = zip(*parts, strict=True)
             return torch.cat(limits2), Extent(*(torch.cat(parts) for parts in zip(*extents, strict=True)))
 
@@ -89,9 +89,8 @@ class Domain:
     @_per_camera
     def edge2(self) -> Tensor:
         """Return (C, 1), the furthest squared radius to which the first stage's radial factor sends its fold."""
-        _, lens = self.optics(columns(precise(self.k)))
-        assert lens.radial is not None
-        edge = self._fold * lens.radial(self._fold * self._fold)
+        radial = present(self.optics(columns(precise(self.k)))[1].radial, "a radial factor")
+        edge = self._fold * radial(self._fold * self._fold)
         return (edge * edge).to(self.k.dtype)
 
     @_per_camera
@@ -103,11 +102,10 @@ class Domain:
         if self.lens.rest is None:
             return self.k.new_full((self.k.shape[0], 1), torch.inf)
         k = precise(self.k)
-        _, lens = self.optics(columns(k))
-        assert lens.rest is not None
+        rest = present(self.optics(columns(k))[1].rest, "a later stage")
         edge = self.edge2.to(k.dtype).sqrt()
-        steps = torch.linspace(0, _WIDER, _STEPS, dtype=k.dtype, device=k.device)
-        least, furthest = lens.rest.lower_bound(edge * steps)
+        steps = torch.linspace(0, _FARTHEST_BOUND, _BOUND_RADII, dtype=k.dtype, device=k.device)
+        least, furthest = rest.lower_bound(edge * steps)
         # a number that changes less from radius to radius than it is large has no zero in between
         certain = least.amin(-1, keepdim=True) - least.diff(dim=-1).abs().amax(-1, keepdim=True)
         furthest_out = torch.where(steps <= 1 + steps[1], furthest, 0.0).amax(-1, keepdim=True)
@@ -157,18 +155,16 @@ class Domain:
         """Return (C, 1), the fold of the first stage's radial factor, in double precision if the device has it."""
         k = precise(self.k)
         chart, lens = self.optics(columns(k))
-        assert lens.radial is not None  # the callers checked it
-        return fold_of(
-            lens.radial, lambda: chart.radii(RADII, k), chart.end(self.k.dtype), torch.finfo(self.k.dtype).max ** 0.25
-        )
+        radial, most = present(lens.radial, "a radial factor"), torch.finfo(self.k.dtype).max ** 0.25
+        return fold_of(radial, lambda: chart.radii(RADII, k), chart.end(self.k.dtype), most)
 
     @_per_camera
     def table(self) -> Tensor:
         """Return the table (C, 2 + 2 nodes) of `inverse`."""
         k = precise(self.k)
         chart, lens = self.optics(columns(k))
-        assert lens.radial is not None
-        return tabulate(lens.radial, self._fold, chart.usual_end(self.k.dtype)).to(self.k.dtype)
+        radial = present(lens.radial, "a radial factor")
+        return tabulate(radial, self._fold, chart.usual_end(self.k.dtype)).to(self.k.dtype)
 
     @cached_property
     def inverse(self) -> InverseTable | None:

@@ -15,13 +15,14 @@ from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import bracketed
 from camtorch.projection.domain import regular
 from camtorch.projection.fold import azimuth
+from camtorch.values.arguments import present
 
 if TYPE_CHECKING:
     from camtorch.projection.domain import Domain
 
 Searched = tuple[Tensor, Tensor, Tensor]
 
-_CLOSE = 0.02  # of a point's distance from the centre: a start whose image is as near to the point is good enough
+_CLOSE_SHARE = 0.02  # of a point's distance from the centre: a start whose image is as near to it will do
 _SLOWEST_TURN = 0.05  # radians that an image turns by, for each by which its point turns: the least that secants assume
 _GIVE_UP = 1e-4  # of a step of Newton's method: shorter parts of it are not tried
 _STAGE_STEPS = 12  # the first ones may take off no more than a third, see `domain._LEAST_SLOPE`
@@ -75,9 +76,7 @@ def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Searched
 
 def _first_image_of_points(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Planes2, Tensor]:
     """Return the points that the stages after the first one send to (u, v), and whether the first one reaches them."""
-    rest, table = domain.optics_of(camera)[1].rest, domain.inverse
-    assert rest is not None  # the caller checked it
-    assert table is not None
+    rest, table = present(domain.optics_of(camera)[1].rest, "a later stage"), present(domain.inverse, "a table")
     p, q = rest.start(u, v)
     for _ in range(_STAGE_STEPS):
         at = rest.at(p, q)
@@ -151,8 +150,7 @@ class _Search:
     def radial(self, u: Tensor, v: Tensor) -> Planes2:
         # at the fold itself the root of a rounded fold may lie beyond the rounded limit
         fold2 = times(self.domain.safe_radius_sq[self.camera, 0], 1 - 64 * torch.finfo(u.dtype).eps)
-        assert self.lens.radial is not None
-        scale = bracketed(self.lens.radial, torch.addcmul(u * u, v, v), fold2)
+        scale = bracketed(present(self.lens.radial, "a radial factor"), torch.addcmul(u * u, v, v), fold2)
         return u * scale, v * scale
 
     def planar(self, u: Tensor, v: Tensor) -> Planes2:
@@ -211,7 +209,7 @@ class _Search:
             error = (u - x) ** 2 + (v - y) ** 2
             better = (error < best) & far  # stop close points, so that a result is the same in any batch
             a, b, best = (torch.where(better, n, o) for n, o in ((rho * c, a), (rho * s, b), (error, best)))
-            far = far & (best > _CLOSE**2 * target * target)
+            far = far & (best > _CLOSE_SHARE**2 * target * target)
             off = torch.atan2(x * v - y * u, x * u + y * v)
             slope = torch.where(step != 0, (last_off - off) / torch.where(step != 0, step, 1.0), 1.0)
             step = (off / slope.clamp(_SLOWEST_TURN, 2.0)).clamp(-1.0, 1.0)
