@@ -18,7 +18,7 @@ from camtorch.evaluate.tensors import are_numbers, known_false, known_true
 from camtorch.poses.rotations import is_right, turn
 from camtorch.projection.evaluation import camera_rows
 from camtorch.projection.native_cameras import Native
-from camtorch.values.arguments import warn
+from camtorch.values.arguments import present, warn
 from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import remade
 from camtorch.warp.affine import AffineWarp, UncheckedWarp, after, made_like
@@ -46,7 +46,7 @@ class LazyWarp:
     """A warp to cameras of which native code wrote the numbers; warp and cameras become modules at first use."""
 
     # what changes ask of a `Warp`, too
-    keeps_lens: ClassVar[bool] = False
+    joins_earlier: ClassVar[bool] = False
     may_mirror: ClassVar[bool] = True
     moves_by_cameras: ClassVar[bool] = True
     like: Camera  # the new cameras are of its model
@@ -161,7 +161,7 @@ class Part:
             return self
         if first is None:
             return replace(second, camera=self.camera)
-        if last.keeps_lens:
+        if last.joins_earlier:
             made = second.warp
             return self.with_warps(lambda warp: made.between(warp.source, warp.target, warp.rotation, **made.options))
         rotation = _turned(first.rotation, last.rotation)
@@ -248,8 +248,8 @@ class Change:
 
     def _gated(self, part: Part) -> Camera:
         """Return the cameras of a part after the change, where the gate is open, and those before it elsewhere."""
-        assert self.gate is not None
-        new, gate = part.target, self.gate if part.rows is None else self.gate[part.rows]
+        new, gate = part.target, present(self.gate, "a gate")
+        gate = gate if part.rows is None else gate[part.rows]
         gate = gate.to(new.intrinsics.device).unsqueeze(-1)
         intrinsics = torch.where(gate, new.intrinsics, part.camera.intrinsics)
         return remade(new, intrinsics=intrinsics, distortion=torch.where(gate, new.distortion, part.camera.distortion))

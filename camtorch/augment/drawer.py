@@ -246,7 +246,7 @@ class CameraDrawer(Augmentation):
         cameras, light = [target], None
         if "chromatic" in beside:
             cameras += [scaled(target, 1 + beside["chromatic"][..., i]) for i in (0, 1)]
-        warp, *others = [Warp.unchecked(source, camera, self._warp_options).turned_by(rotation) for camera in cameras]
+        warp, *others = [Warp.of_valid(source, camera, self._warp_options).turned_by(rotation) for camera in cameras]
         if "vignetting" in beside:
             light = falloff(target, beside["vignetting"])
         if "cos4" in beside:

@@ -32,12 +32,16 @@ MODES: dict[Mode, ModeOfSampling] = {
     "bilinear": ModeOfSampling(structs.BILINEAR, 0, 1, True),
     "bicubic": ModeOfSampling(structs.BICUBIC, 2, 2),
 }
-PADDINGS = {"zeros": structs.ZEROS, "border": structs.BORDER, "reflection": structs.REFLECTION}
-_TYPES = {torch.uint8: structs.UINT8, torch.bool: structs.BOOL, torch.uint16: structs.UINT16}
-_TYPES[torch.float32] = structs.FLOAT32
+PADDING_CODES = {"zeros": structs.ZEROS, "border": structs.BORDER, "reflection": structs.REFLECTION}
+_TYPES = {
+    torch.uint8: structs.UINT8,
+    torch.bool: structs.BOOL,
+    torch.uint16: structs.UINT16,
+    torch.float32: structs.FLOAT32,
+}
 _BYTES = {1: structs.BYTES1, 2: structs.BYTES2, 4: structs.BYTES4, 8: structs.BYTES8}
-_TILE = 1 << 15  # pixels of a tile, some 0.1 ms a channel
-_WORTH = 8  # pixels that may be copied for one that is made: interpolated one by one they would take longer
+_TILE_PIXELS = 1 << 15  # some 0.1 ms a channel
+_MOST_COPIED = 8  # pixels for one that is made: interpolated one by one they would take longer
 
 
 def takes(dtype: torch.dtype, mode: Mode) -> bool:
@@ -77,7 +81,7 @@ class Call:
         self._results = [] if out is not None else [result]  # of the first call
         self._layout: torch.memory_format | None = None  # of the copies of images that lie oddly in memory
         self._is_copied = False  # whether results lie so as well
-        if not is_quick(images, result, mode) and math.prod(images.shape[2:]) <= _WORTH * math.prod(size):
+        if not is_quick(images, result, mode) and math.prod(images.shape[2:]) <= _MOST_COPIED * math.prod(size):
             together = _are_together(result, mode)
             self._layout = torch.channels_last if together else torch.contiguous_format
             self._is_copied = not together and result.stride(3) != 1
@@ -133,11 +137,11 @@ def describe(job: structs.Job, images: Tensor, result: Tensor, mode: Mode, paddi
     job.hold(owners)
     job.fill, job.fill_elements = fills.data_ptr(), elements.data_ptr()
     job.type = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
-    job.mode, job.padding, job.tile_rows = MODES[mode].code, PADDINGS[padding], _tile_rows(result.shape[3])
+    job.mode, job.padding, job.tile_rows = MODES[mode].code, PADDING_CODES[padding], _tile_rows(result.shape[3])
 
 
 def _tile_rows(width: int) -> int:
-    return max(_TILE // width // 8, 1) * 8
+    return max(_TILE_PIXELS // width // 8, 1) * 8
 
 
 def tiles_of(result: Tensor) -> int:
@@ -217,7 +221,7 @@ def _lay(nodes: Tensor, cells: Tensor, exact: Tensor, grid: Tensor, mapped: Tens
         raise ValueError(f"cells must be those of {tuple(grid.shape[1:3])} pixels; got {tuple(cells.shape[1:])}")
     call.nodes, call.cells, call.exact, call.grid = (t.data_ptr() for t in (nodes, cells, exact, grid))
     call.mapped, call.is_transposed = None if mapped is None else mapped.data_ptr(), mapped is None
-    tasks = call.count if mapped is None else -(-grid[..., 0].numel() // _TILE)
+    tasks = call.count if mapped is None else -(-grid[..., 0].numel() // _TILE_PIXELS)
     spread(functools.partial(loaded().camtorch_lay, call), min(thread_count(), tasks))
 
 
@@ -244,6 +248,7 @@ def classify(
     )
     asked.node_strides[:], asked.mapped_stride, asked.rim_stride = nodes.stride()[:2], mapped.stride(0), rim.stride(0)
     asked.count, asked.rows, asked.columns, (asked.height, asked.width) = count, rows, columns, size
-    (asked.source_height, asked.source_width), asked.tolerance, asked.padding = source, tolerance, PADDINGS[padding]
+    asked.source_height, asked.source_width = source
+    asked.tolerance, asked.padding = tolerance, PADDING_CODES[padding]
     loaded().camtorch_classify(asked)
     return cells

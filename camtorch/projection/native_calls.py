@@ -15,13 +15,13 @@ from torch import Tensor
 
 from camtorch.native import memory, structs
 from camtorch.native.library import loaded
-from camtorch.native.sampler import PADDINGS
+from camtorch.native.sampler import PADDING_CODES
 from camtorch.projection.native_cameras import Native, address
 from camtorch.values.threads import spread, thread_count
 
 _Call = TypeVar("_Call")
-_TILE = 1 << 14  # points of a tile, some 30 us
-_SHARED = 1 << 15  # points: with fewer, to wake threads would take longer
+_TILE_POINTS = 1 << 14  # some 30 us
+_SHARED_POINTS = 1 << 15  # with fewer, to wake threads would take longer
 
 
 def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -80,7 +80,7 @@ def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[
     cameras, count, _ = points.shape
     by_points = torch.empty(2, cameras, count, 3, dtype=native.dtype, device="cpu")
     sums = torch.zeros(2, cameras, count, (4 + native.plan.parameters) * by_camera, dtype=torch.float64, device="cpu")
-    tile = 1 if by_camera else _TILE
+    tile = 1 if by_camera else _TILE_POINTS
     for one, by, to in zip(torch.eye(2, dtype=native.dtype, device="cpu"), by_points, sums, strict=True):
         call = structs.Rows()
         call.rows, call.row_strides[:], call.direction = points.data_ptr(), points.stride(), structs.PROJECT_VJP
@@ -108,7 +108,7 @@ def _vjp(
         raise ValueError(f"cotangents must be of {tuple(shape)} rows; got {tuple(cotangents.shape[1:])}")
     cameras, count = shape
     results = _empty((cameras, count, size), native.dtype) if size else None
-    tiles, sums = -(-count // _TILE), None
+    tiles, sums = -(-count // _TILE_POINTS), None
     if want_parameters:
         sums = torch.zeros(cameras, tiles, 4 + native.plan.parameters, dtype=torch.float64, device="cpu")
     if results is not None:
@@ -167,7 +167,7 @@ class Lattices:
         cells.mapped, cells.rim, cells.cells, cells.scratch = valid, valid + nodes, self.cells.data_ptr(), scratch
         cells.mapped_stride, cells.rim_stride, cells.count, cells.rows, cells.columns = count, count, cameras, n, m
         (cells.height, cells.width), (cells.source_height, cells.source_width) = size, source_size
-        cells.tolerance, cells.padding = tolerance, PADDINGS[padding]
+        cells.tolerance, cells.padding = tolerance, PADDING_CODES[padding]
         self.struct, self._is_double = made, is_double
 
     def lay(self, job: structs.Job) -> None:
@@ -214,11 +214,11 @@ class NativeMove:
         result = torch.empty(self.cameras, count, 2, dtype=self._start.dtype, device="cpu")
         valid = torch.empty(self.cameras, count, dtype=torch.bool, device="cpu")
         call, counters = structs.Move.from_buffer_copy(self._move), _per_thread.counters
-        call.form, (call.height, call.width), call.count, call.tile = form, self._size, count, _TILE
+        call.form, (call.height, call.width), call.count, call.tile = form, self._size, count, _TILE_POINTS
         call.rows, call.row_strides[:] = address_and_strides(pixels)
         call.results, call.result_strides[:], call.valid = result.data_ptr(), (2 * count, 2, 1), valid.data_ptr()
         call.next = addressof(counters)
-        tiles = -(-count // _TILE) * self.cameras if self.cameras * count >= _SHARED else 1
+        tiles = -(-count // _TILE_POINTS) * self.cameras if self.cameras * count >= _SHARED_POINTS else 1
         run_and_follow(loaded().camtorch_moves, call, tiles, counters, self._start, self._end)
         return result, valid
 
@@ -269,12 +269,12 @@ class _PerThread(threading.local):
 
 
 _per_thread = _PerThread()
-_MOST_KEPT = 1 << 22  # bytes
+_MOST_KEPT_BYTES = 1 << 22
 
 
 def _kept_memory(count: int) -> Tensor:
     """Return at least `count` bytes: memory that calls of this thread reuse, or new memory if `count` is large."""
-    if count > _MOST_KEPT:
+    if count > _MOST_KEPT_BYTES:
         return torch.empty(count, dtype=torch.uint8, device="cpu")
     if _per_thread.memory is None or _per_thread.memory.shape[0] < count:
         with torch.inference_mode(False):
@@ -295,18 +295,18 @@ def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
     return torch.empty(size, dtype=dtype, device="cpu")
 
 
-def _call(native: Native, cameras: int, count: int, call: structs.Rows, tile: int = _TILE) -> int:
+def _call(native: Native, cameras: int, count: int, call: structs.Rows, tile: int = _TILE_POINTS) -> int:
     """Call the native geometry with rows, their results and the other arguments of `Rows`."""
     if cameras != native.cameras:  # C would read elsewhere
         raise ValueError(f"rows must be of {native.cameras} cameras; got those of {cameras}")
     call.cameras, call.count, call.tile = native.pointer, count, tile
     run, points = loaded().camtorch_geometry, cameras * count
-    if points < _SHARED:
+    if points < _SHARED_POINTS:
         return run(call) if points else 0
     following = c_int64(0)
     call.next = addressof(following)
     left: list[int] = []
-    spread(lambda: left.append(run(call)), min(thread_count(), -(-count // _TILE) * cameras))
+    spread(lambda: left.append(run(call)), min(thread_count(), -(-count // _TILE_POINTS) * cameras))
     return sum(left)
 
 

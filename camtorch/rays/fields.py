@@ -25,8 +25,8 @@ from camtorch.values.arguments import (
     working_dtype,
 )
 
-_MOST_KEPT = 1 << 19  # rays, 6 MB in float32, at most, that each camera of a large data set keeps
-_STRAIGHT = 1e-24  # the squared sine of the angle to the vertical up to which a ray counts as vertical
+_MOST_KEPT_RAYS = 1 << 19  # 6 MB in float32, at most, that each camera of a large data set keeps
+_VERTICAL_SINE_SQ = 1e-24  # the squared sine of the angle to the vertical up to which a ray counts as vertical
 
 
 def on_image(pixels: Numbers, size: tuple[int, int], owner: str) -> Tensor:
@@ -64,7 +64,7 @@ def over_image(
     if is_unknown(camera.intrinsics):  # nothing is kept, and a comparison would bound symbolic sizes
         return compute()
     step = max(as_whole(stride, "stride", "pixel_grid"), 1)
-    if math.prod((*camera.batch_shape, *camera.size_for("pixel_grid"))) // step**2 > _MOST_KEPT:
+    if math.prod((*camera.batch_shape, *camera.size_for("pixel_grid"))) // step**2 > _MOST_KEPT_RAYS:
         return compute()
     return memo.copies(inputs, (camera.form, stride), compute)
 
@@ -165,7 +165,7 @@ def perspective_field(camera: CameraLike, gravity: Numbers, stride: int) -> tupl
         seen = (frame * upward[..., None, None, None, :].to(frame.dtype)).sum(-1)  # x, y, z of the local frame
         across, along = seen[..., :2], seen[..., 2]
         length = across.square().sum(-1)
-        tilted = valid & (length > _STRAIGHT)
+        tilted = valid & (length > _VERTICAL_SINE_SQ)
         across = torch.where(tilted[..., None], across, across.new_tensor([0.0, -1.0]))
         up = (per_unit * across[..., None, :]).sum(-1)
         up = torch.where(tilted[..., None], up / up.square().sum(-1, keepdim=True).sqrt(), 0.0)

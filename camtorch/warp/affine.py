@@ -29,10 +29,10 @@ from camtorch.warp.plan import Route
 from camtorch.warp.sampling import SHRINKS, render
 from camtorch.warp.warp import Warp
 
-_MOST = 8  # an image is halved this often at most
-_PLAIN = (torch.uint8, torch.float32, torch.float64)  # torch interpolates these dtypes without a conversion
-_WHOLE = 1e-9  # pixels: a number of a map this close to a whole one counts as whole
-_NEARLY = 1e-6  # pixels: the same for the inverse map
+_MOST_HALVINGS = 8  # an image is halved this often at most
+_PLAIN_DTYPES = (torch.uint8, torch.float32, torch.float64)  # torch interpolates these dtypes without a conversion
+_MAP_ROUNDING = 1e-9  # pixels: a number of a map this close to a whole one counts as whole
+_INVERSE_ROUNDING = 1e-6  # pixels: the same for the inverse map
 
 
 Rows = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -51,7 +51,7 @@ class ImageEdit(NamedTuple):
 
 
 class UncheckedWarp(Warp):
-    """A `Warp` whose rotation is not checked, and may be a mirror.
+    """A `Warp` whose rotation may be a mirror, and is not checked, and which may antialias by itself.
 
     antialias=None halves images that shrink by more than 1.5.
     """
@@ -254,7 +254,7 @@ def made_like(warp: Warp, source: Camera, target: Camera, rotation: Tensor | Non
 
 def _resized(images: Tensor, size: Sequence[int], mode: str = "bilinear", flips: tuple[int, ...] = ()) -> Tensor:
     """Return images resized by torch with antialiasing, then flipped."""
-    plain = images.dtype in _PLAIN
+    plain = images.dtype in _PLAIN_DTYPES
     made = F.interpolate(images if plain else widen(images), size, mode=mode, align_corners=False, antialias=True)
     made = made.flip(flips) if flips else made  # flip before narrowing: unsigned dtypes have no flip
     return made if plain else narrow(made, images.dtype)
@@ -266,7 +266,7 @@ def _way(
     """Return how a map edits images of size `before`; torch resizes them if more than `least` pixels become one."""
     (a, b, left), (c, d, top) = rows
     whole = tuple(round(x) for x in (a, b, left, c, d, top))
-    near = all(abs(x - n) < _WHOLE for x, n in zip((a, b, left, c, d, top), whole, strict=True))
+    near = all(abs(x - n) < _MAP_ROUNDING for x, n in zip((a, b, left, c, d, top), whole, strict=True))
     if near and abs(a) + abs(b) == abs(c) + abs(d) == 1 and padding == "zeros":
         return ImageEdit(padding, move=whole)
     (a, b, left), (c, d, top) = inverted(rows)
@@ -274,9 +274,13 @@ def _way(
     corners = (-0.5, -0.5), (after[1] - 0.5, after[0] - 0.5)
     ends = [(a * u + b * v + left + 0.5, c * u + d * v + top + 0.5) for u, v in corners]
     (x, right), (y, bottom) = (sorted(places) for places in zip(*ends, strict=True))
-    is_inside = min(x, y) > -_NEARLY and right < before[1] + _NEARLY and bottom < before[0] + _NEARLY
+    is_inside = (
+        min(x, y) > -_INVERSE_ROUNDING
+        and right < before[1] + _INVERSE_ROUNDING
+        and bottom < before[0] + _INVERSE_ROUNDING
+    )
     box = tuple(round(edge) for edge in (x, y, right, bottom))
-    near = all(abs(edge - n) < _NEARLY for edge, n in zip((x, y, right, bottom), box, strict=True))
+    near = all(abs(edge - n) < _INVERSE_ROUNDING for edge, n in zip((x, y, right, bottom), box, strict=True))
     if near and is_inside and b == 0 and max(abs(a), abs(d)) > least:
         return ImageEdit(padding, box=box, flips=tuple(dim for dim, sign in ((-1, a), (-2, d)) if sign < 0))
     halvings = _halved((math.hypot(a, c) + math.hypot(b, d)) / 2) if decides else 0
@@ -286,7 +290,7 @@ def _way(
 
 def _halved(scale: float) -> int:
     """Return how often to halve an image so that at most one and a half of its pixels become one."""
-    return min(max(math.ceil(math.log2(max(scale / SHRINKS, 0.5))), 0), _MOST)
+    return min(max(math.ceil(math.log2(max(scale / SHRINKS, 0.5))), 0), _MOST_HALVINGS)
 
 
 def _halvings(where: Positions, source: Camera) -> list[int]:

@@ -54,7 +54,7 @@ class CropsWarp(Warp):
         def made() -> Warp:
             source, target = (flattened(camera, self.batch_shape) for camera in (self.source, self.target))
             rotation = cast("Tensor", self.rotation).flatten(0, 1)
-            return Warp.unchecked(source, target, self.options).turned_by(rotation)
+            return Warp.of_valid(source, target, self.options).turned_by(rotation)
 
         return self._rows.unless_learning(self.tensors, (*self.form, *self.options.values()), made)
 

@@ -36,9 +36,9 @@ from camtorch.warp.cells import are_smooth, classify, lay_quintics, places, pref
 from camtorch.warp.lattice import Lattice, PixelPositions, Positions
 from camtorch.warp.panorama import goes_round, lengths, off_poles, seam_of, within_turn
 
-_STRIP = 1 << 19  # pixels
-FEWEST = 8  # cells along a side: with fewer, exact positions take less time than a lattice
-MOST_KEPT = 1 << 16  # nodes of a lattice whose pixels are kept for the next one
+_STRIP_PIXELS = 1 << 19
+FEWEST_CELLS = 8  # along a side: with fewer, exact positions take less time than a lattice
+MOST_KEPT_NODES = 1 << 16  # of a lattice whose pixels are kept for the next one
 
 
 class Between(NamedTuple):
@@ -127,7 +127,7 @@ def _row_by_row(cameras: Between, rows: range) -> tuple[Tensor, Tensor]:
     # by strips, which reuse the memory of intermediate results
     count = max(math.prod(camera.batch_shape) for camera in (cameras.source, target))
     count = count if cameras.rotation is None else max(count, math.prod(cameras.rotation.shape[:-2]))
-    step = max(_STRIP // max(count * target.size_for("Warp")[1], 1), 1)
+    step = max(_STRIP_PIXELS // max(count * target.size_for("Warp")[1], 1), 1)
     first, seen = exact(rows[:step])
     if len(rows) <= step:
         return first, seen
@@ -210,7 +210,7 @@ def on_lattice(cameras: Between, rows: range, tolerance: float, padding: str) ->
     """
     target = cameras.target
     size = len(rows), target.size_for("Warp")[1]
-    if not is_eager(target.intrinsics) or math.ceil(min(size) / STEP) < FEWEST:
+    if not is_eager(target.intrinsics) or math.ceil(min(size) / STEP) < FEWEST_CELLS:
         return None
     find = _learning if keeps_graph(*cameras.tensors) else _found
     return find(cameras, rows.start, size, tolerance, padding)
@@ -315,7 +315,7 @@ def probes(first: int, size: tuple[int, int], dtype: torch.dtype, more: int = 5)
     more: how many more nodes than cells there are along an axis.
     """
     nodes = (math.ceil(size[0] / STEP) + more) * (math.ceil(size[1] / STEP) + more)
-    return (_kept_probes if nodes <= MOST_KEPT else _new_probes)(first, size, dtype, more)
+    return (_kept_probes if nodes <= MOST_KEPT_NODES else _new_probes)(first, size, dtype, more)
 
 
 def _new_probes(first: int, size: tuple[int, int], dtype: torch.dtype, more: int) -> Tensor:

@@ -13,6 +13,7 @@ Mode: TypeAlias = sampler.Mode
 PaddingMode = Literal["zeros", "border", "reflection"]
 Fill = float | Sequence[float]
 MODES = tuple(sampler.MODES)
+# in an order that two things need: positions for one padding serve those before it, and places are torch's codes
 PADDINGS: tuple[PaddingMode, ...] = get_args(PaddingMode)
 
 
@@ -47,6 +48,11 @@ class TolerantOptions(WarpOptions, total=False):
     """The options of warps that may interpolate positions, within `tolerance` pixels."""
 
     tolerance: float | None
+
+
+def serving_all(*paddings: PaddingMode) -> PaddingMode:
+    """Return the padding whose positions serve all of these."""
+    return PADDINGS[max(map(PADDINGS.index, paddings))]
 
 
 def as_options(

@@ -44,15 +44,15 @@ from camtorch.warp import compiled
 from camtorch.warp.grid import local_scale, locate
 from camtorch.warp.lattice import PixelPositions, Positions
 from camtorch.warp.moving import moved_pixels
-from camtorch.warp.options import PADDINGS, Mode, Options, PaddingMode, Sampler
+from camtorch.warp.options import Mode, Options, PaddingMode, Sampler, serving_all
 from camtorch.warp.panorama import Seam, seam_of, with_seam
 from camtorch.warp.sampling import Pyramid, by_torch, laid_as, prepared, render
 
 Route = Literal["operator", "strips", "graph", "kept"]
-_MOST_KEPT = 1 << 25  # pixels of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
-_STRIP = 1 << 21  # pixels of such a strip
+_MOST_KEPT_PIXELS = 1 << 25  # of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
+_STRIP_PIXELS = 1 << 21  # of such a strip
 _MOST_CALLS = 8  # forms of images for which a call is kept
-_SINGLE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels wide, computed in float32
+_FLOAT32_TOLERANCE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels wide
 
 
 def _part(held: str, name: str) -> Any:
@@ -96,7 +96,7 @@ class CameraPair(GeometryModule):
     """The state of a `Warp`: source, target, rotation and options; and where target pixels lie."""
 
     moves_by_cameras: ClassVar[bool] = True  # and a rotation: native code and operators need no more
-    keeps_lens: ClassVar[bool] = False  # True: after another warp both are one, `between` the cameras of that
+    joins_earlier: ClassVar[bool] = False  # True: after another warp both are one, `between` the cameras of that
     keeps_depth: ClassVar[bool] = False  # True: depths along the axis stay, as the camera does
     may_mirror: ClassVar[bool] = False  # True: the rotation may be a mirror
     batch_shape: torch.Size
@@ -136,7 +136,7 @@ class CameraPair(GeometryModule):
         return [name for name in names if name not in inside]
 
     @classmethod
-    def unchecked(cls, *given: Any) -> Self:
+    def of_valid(cls, *given: Any) -> Self:
         """Return a warp, without a rotation yet, from valid arguments of `set_up`."""
         warp = cls.__new__(cls)
         warp.set_up(*given)
@@ -182,7 +182,7 @@ class CameraPair(GeometryModule):
         if self._tolerance is not None:
             return self._tolerance
         single = self.source.intrinsics.dtype == self.target.intrinsics.dtype == torch.float32
-        return _SINGLE if single else 0.0
+        return _FLOAT32_TOLERANCE if single else 0.0
 
     @property
     def tensors(self) -> list[Tensor]:
@@ -243,7 +243,7 @@ class CameraPair(GeometryModule):
             return "graph"
         if torch.compiler.is_compiling():  # sizes that a program leaves open would be bounded in it by a comparison
             return "operator" if images is not None and self.goes_by_operator(images) else "kept"
-        if is_pinned or math.prod((*self.batch_shape, *self.target.size_for("Warp"))) <= _MOST_KEPT:
+        if is_pinned or math.prod((*self.batch_shape, *self.target.size_for("Warp"))) <= _MOST_KEPT_PIXELS:
             return "kept"
         looks = all(t.is_cpu and not is_unknown(t) for t in self.tensors)
         return "strips" if looks and (images is None or not in_graph(images)) else "kept"
@@ -281,7 +281,7 @@ class CameraPair(GeometryModule):
         route, given = route or self.route(images), images
         images = self.lengthened(images)
         if route == "operator":
-            options = self.tolerance, self.antialias, self._padding_served(sampler.padding_mode), sampler
+            options = self.tolerance, self.antialias, serving_all(self.padding_mode, sampler.padding_mode), sampler
             return compiled.warped(images, self.sampled, self.target, self.rotation, *options)
         if route == "strips":
             cameras = math.prod(self.batch_shape)
@@ -309,7 +309,7 @@ class CameraPair(GeometryModule):
 
     def positions(self, route: Route, padding: PaddingMode = "zeros") -> Positions:
         """Return the positions at which target pixels sample the source's image: kept ones unless they have a graph."""
-        is_traced, served, tolerance = in_jit_trace(), self._padding_served(padding), self.tolerance
+        is_traced, served, tolerance = in_jit_trace(), serving_all(self.padding_mode, padding), self.tolerance
         if route == "graph":
             if is_traced:
                 raise RuntimeError(
@@ -348,11 +348,11 @@ class CameraPair(GeometryModule):
     def strip_positions(self, padding: PaddingMode = "zeros", count: int | None = None) -> Iterator[tuple[slice, Any]]:
         """Yield rows of the target, `count` at a time, and their positions on the source's image."""
         height, width = self.target.size_for("Warp")
-        step = count or max(_STRIP // (max(math.prod(self.batch_shape), 1) * width), 1)
+        step = count or max(_STRIP_PIXELS // (max(math.prod(self.batch_shape), 1) * width), 1)
         for top in range(0, height, step):
             rows = range(top, min(top + step, height))
             with torch.no_grad():
-                where = self.locate(rows, self._padding_served(padding), self.tolerance)
+                where = self.locate(rows, serving_all(self.padding_mode, padding), self.tolerance)
             yield slice(rows.start, rows.stop), where
 
     def in_strips(self, images: Tensor, count: int | None, sampler: Sampler) -> Iterator[tuple[slice, Tensor, Tensor]]:
@@ -370,11 +370,6 @@ class CameraPair(GeometryModule):
         pixels = (grid + 1) * grid.new_tensor(source.size_for("Warp")[::-1]) / 2 - 0.5
         return (where.pixels.mapped & source.contains(pixels)).unsqueeze(1)
 
-    def _padding_served(self, padding: PaddingMode) -> PaddingMode:
-        """Return the padding of positions that serve the warp's own padding and this one."""
-        # torch.compile knows no max with a key
-        return PADDINGS[max(PADDINGS.index(self.padding_mode), PADDINGS.index(padding))]
-
     def _constant(self, padding: PaddingMode) -> Positions | None:
         """Return the positions as a constant of an exported program; None if they depend on its inputs."""
         if not self.is_pinned and not is_constant(self):
@@ -387,4 +382,6 @@ class CameraPair(GeometryModule):
                 return where._replace(grid=grid, mapped=mapped)
 
             known = self._positions()
-            return own() if known.is_pinned else known.serving(f"constant {self._padding_served(padding)}", own)
+            return (
+                own() if known.is_pinned else known.serving(f"constant {serving_all(self.padding_mode, padding)}", own)
+            )

@@ -20,8 +20,8 @@ from camtorch.projection.evaluation import native_forms
 from camtorch.projection.native_calls import Lattices, NativeMove, run_and_follow
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
-from camtorch.warp.grid import FEWEST, MOST_KEPT, coarse, probes
-from camtorch.warp.options import PADDINGS, Options, Sampler
+from camtorch.warp.grid import FEWEST_CELLS, MOST_KEPT_NODES, coarse, probes
+from camtorch.warp.options import Options, Sampler, serving_all
 from camtorch.warp.panorama import goes_round
 from camtorch.warp.plan import CameraPair
 from camtorch.warp.sampling import SHRINKS, SURELY
@@ -36,8 +36,8 @@ Reader = Callable[[Tensor, int], MovedField]
 Sizes = tuple[tuple[int, int], tuple[int, int]]  # (height, width) of the source's image, and of the target's
 
 _FORMS = {"pose": structs.POSE, "rotation vectors": structs.ROTATION_VECTORS}  # others are rays
-_FEW = 2  # tiles: an image of no more is made by one thread
-_EVEN = 4  # samples a thread: with as many, threads that idle at the end matter little
+_TILES_FOR_ONE_THREAD = 2  # an image of no more is made by one
+_SAMPLES_PER_THREAD = 4  # with as many, threads that idle at the end matter little
 _FLAGS_OF_PIXELS = 1 << structs.LEFT_BITS  # flags of pixels stand above those of the lattice
 
 
@@ -76,7 +76,7 @@ def call_for(
         return None
     if count > 1:
         threads = thread_count()
-        if dtype != torch.float32 or (count % threads and count < _EVEN * threads):
+        if dtype != torch.float32 or (count % threads and count < _SAMPLES_PER_THREAD * threads):
             return None
     given = sizes, dtype, tolerance, antialias is None, batched
     forms = [(t.shape, t.stride(), t.dtype, how) for t, how in zip(values, hows, strict=True)]
@@ -84,7 +84,9 @@ def call_for(
 
     def made() -> SampleCall | None:
         n, m = (math.ceil(side / structs.STEP) for side in sizes[1])
-        if min(n, m) < FEWEST or (n + 5) * (m + 5) > MOST_KEPT:  # too small for a lattice, or too large to be kept
+        if (
+            min(n, m) < FEWEST_CELLS or (n + 5) * (m + 5) > MOST_KEPT_NODES
+        ):  # too small for a lattice, or too large to be kept
             return None
         for value, how in zip(values, hows, strict=True):
             if not isinstance(how, Sampler):
@@ -167,7 +169,7 @@ class SampleCall:
         """Take the arguments of `call_for`; decides: whether images that shrink are antialiased, unlike here."""
         self._sizes, self._dtype, self._count, self._batched = sizes, dtype, count, batched
         samplers = [how for how in hows if isinstance(how, Sampler)]
-        padding = PADDINGS[max((PADDINGS.index(how.padding_mode) for how in samplers), default=0)]
+        padding = serving_all("zeros", *(how.padding_mode for how in samplers))
         with torch.inference_mode(False):
             nodes = probes(0, sizes[1], dtype)
             self._lattices = Lattices(nodes, sizes[1], sizes[0], tolerance, padding, count)
@@ -194,7 +196,7 @@ class SampleCall:
                 reader = self._reader_of_vectors(next(free_turns), value, how)
             self._readers.append(reader)
         self._images_of_call = images if count == 1 else 0  # those of a batch are made with their lattices
-        self._one_thread = self._most_tiles <= _FEW or not self._images_of_call  # whether it makes all
+        self._one_thread = self._most_tiles <= _TILES_FOR_ONE_THREAD or not self._images_of_call  # whether it makes all
         self._copied = [  # which values C reads from copies
             i
             for i, (value, how) in enumerate(zip(values, hows, strict=True))

@@ -21,9 +21,9 @@ from camtorch.warp.options import PaddingMode, Sampler
 
 SHRINKS = 1.5  # pixels of the image to one of the result, from which on edits antialias by themselves
 SURELY = 0.999  # of that: images that shrink less do not antialias, whatever rounding does
-_LARGE = 1 << 23  # numbers in an image whose copy in float32 leaves every cache
-_STRIP = 1 << 17  # numbers of a result in float32 that are made at a time
-_TILE = 512  # pixels along the sides of what is then sampled at a time
+_CACHED_NUMBERS = 1 << 23  # in an image: a larger one leaves every cache when it is copied in float32
+_STRIP_NUMBERS = 1 << 17  # of a result in float32 that are made at a time
+_TILE_SIDE = 512  # pixels of what is then sampled at a time
 _TRACED_LEVELS = 4  # if the values that decide cannot be read: down to a sixteenth
 
 
@@ -93,7 +93,7 @@ def _within_memory(images: Tensor, where: PixelPositions, how: Sampler, kept: di
     if dtype == wide_dtype(dtype) or not (is_eager(images, where.grid) and are_plain(images, where.grid)):
         levels = _levels(kept, 0, widen(images))
         return narrow(_one_piece(levels.images, where.grid, where, levels, how), dtype)
-    large = math.prod(images.shape[1:]) > _LARGE
+    large = math.prod(images.shape[1:]) > _CACHED_NUMBERS
     # the step must not change between strips of the target: `kept` has the pyramids of parts by their first image
     step = 1 if large else thread_count()
     if count <= step and not large:
@@ -115,7 +115,7 @@ def _by_strips(images: Tensor, where: PixelPositions, how: Sampler, kept: dict[i
     height, width = where.size
     copy = memory.empty(tuple(images.shape), wide_dtype(images.dtype), sampler.layout(images))
     levels, result = _levels(kept, 0, copy.copy_(images)), sampler.maker(images, len(images), where.size)()
-    rows = max(_STRIP // max(math.prod(images.shape[:2]) * width, 1), 1)
+    rows = max(_STRIP_NUMBERS // max(math.prod(images.shape[:2]) * width, 1), 1)
     for top in range(0, height, rows):
         here = where.part(slice(top, top + rows))
         made = narrow(_one_piece(levels.images, here.grid, here, levels, how), images.dtype)
@@ -148,9 +148,9 @@ def _levels(kept: dict[int, Pyramid] | None, i: int, images: Tensor) -> Pyramid:
 
 def _render_tiles(result: Tensor, levels: Pyramid, where: PixelPositions, how: Sampler) -> None:
     """Render an image in tiles of the target, each from a copy of the part that it reads."""
-    for top in range(0, result.shape[2], _TILE):
-        for left in range(0, result.shape[3], _TILE):
-            down, across = slice(top, top + _TILE), slice(left, left + _TILE)
+    for top in range(0, result.shape[2], _TILE_SIDE):
+        for left in range(0, result.shape[3], _TILE_SIDE):
+            down, across = slice(top, top + _TILE_SIDE), slice(left, left + _TILE_SIDE)
             here = where.part(down, across)
             images, grid = _part_read(levels.images, here, how)
             result[:, :, down, across] = narrow(_one_piece(images, grid, here, levels, how), result.dtype)

@@ -31,12 +31,12 @@ from camtorch.warp.warp import Warp
 Direction = Literal["down", "up", "right", "left"]
 DIRECTIONS: tuple[Direction, ...] = get_args(Direction)
 
-_LONGEST = 2.0  # seconds
-_FASTEST = 70.0  # radians per second: twice what gyroscopes measure
-_BEYOND = 1.0  # readouts from the middle, half an image beyond the rim: further out, time is clamped
+_LONGEST_READOUT = 2.0  # seconds
+_FASTEST_RATE = 70.0  # radians per second: twice what gyroscopes measure
+_FARTHEST_READOUT = 1.0  # readouts from the middle, half an image beyond the rim: further out, time is clamped
 _STEPS = 4  # of the secant method, before one Newton step
-_SETTLED = 0.01  # pixels: a point is found if its row is off by less
-_STILL = 1e-3  # rows per row that the readout must gain on the passing scene
+_SETTLED_ROWS = 0.01  # a point is found if its row is off by less
+_LEAST_GAIN = 1e-3  # rows per row that the readout must gain on the passing scene
 
 
 class RollingShutter(GeometryModule):
@@ -75,11 +75,11 @@ class RollingShutter(GeometryModule):
         readout = as_real(readout, "readout", owner, rates.device)
         if readout.ndim > 1:
             raise ValueError(f"{owner}: readout must be a number or (B,); got shape {tuple(readout.shape)}")
-        if known_false(readout.detach().abs() < _LONGEST):
+        if known_false(readout.detach().abs() < _LONGEST_READOUT):
             raise ValueError(
                 f"{owner}: readout must be below 2 seconds; got {readout.tolist()}. Pass milliseconds as readout / 1000"
             )
-        if known_false(rates.detach().abs() < _FASTEST):
+        if known_false(rates.detach().abs() < _FASTEST_RATE):
             raise ValueError(
                 f"{owner}: rates must be below 70 radians per second; got {rates.tolist()}. numpy.deg2rad takes degrees"
             )
@@ -104,7 +104,7 @@ class RollingShutter(GeometryModule):
         """Return when pixels (..., 2) are read, in readouts from the middle one."""
         across = self.direction in ("right", "left")
         share = (pixels[..., 0 if across else 1] + 0.5) / size[1 if across else 0] - 0.5
-        share = share.clamp(-_BEYOND, _BEYOND)
+        share = share.clamp(-_FARTHEST_READOUT, _FARTHEST_READOUT)
         return -share if self.direction in ("up", "left") else share
 
     def turned(self, rays: Tensor, share: Tensor, sign: float) -> Tensor:
@@ -171,7 +171,7 @@ class ShutterWarp(UncheckedWarp):
     """
 
     moves_by_cameras = False
-    keeps_lens = True
+    joins_earlier = True
     _has_shutters = True
     shutter: RollingShutter | None
     target_shutter: RollingShutter | None
@@ -269,13 +269,13 @@ class InMotion:
                 flat = change == 0
                 step = torch.where(flat, missed, missed * (before - share) / torch.where(flat, 1.0, change))
                 before, missed_before = share, missed
-                share = (share + step.clamp(-0.5, 0.5)).clamp(-_BEYOND, _BEYOND)
+                share = (share + step.clamp(-0.5, 0.5)).clamp(-_FARTHEST_READOUT, _FARTHEST_READOUT)
             h = 1e-4 if share.dtype == torch.float64 else 1e-2
             slope = (seen(share + h)[2] - seen(share - h)[2]) / (2 * h)
         found = seen(share)[2]  # a Newton step from there has the derivatives of the solution
         off = found - share
-        settled = (off.detach().abs() * side < _SETTLED) | (found.detach().abs() >= _BEYOND)
-        settled = settled & ((1 - slope).abs() > _STILL)
+        settled = (off.detach().abs() * side < _SETTLED_ROWS) | (found.detach().abs() >= _FARTHEST_READOUT)
+        settled = settled & ((1 - slope).abs() > _LEAST_GAIN)
         pixels, valid, _ = seen(share + torch.where(settled, off / torch.where(settled, 1 - slope, 1.0), 0.0))
         valid = valid & settled
         return torch.where(valid.unsqueeze(-1), pixels, -1.0), valid

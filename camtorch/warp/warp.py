@@ -291,7 +291,7 @@ class Warp(CameraPair):
         return self.between(self.target, self.source, transposed(self.rotation), **self.options)
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
-        """Return a warp like this one, mirrored or not, between other cameras.
+        """Return a warp like this one between other cameras.
 
         A kind of warp that is made of more than cameras, such as a shutter, keeps that unless `options` have another.
         """

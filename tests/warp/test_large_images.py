@@ -38,8 +38,8 @@ def test_tiles_of_a_large_image_change_nothing(dtype, mode, padding_mode, monkey
         expected = one(given.double())
         if dtype in (torch.uint8, torch.uint16):
             expected = expected.clamp(0, torch.iinfo(dtype).max)
-        monkeypatch.setattr(sampling, "_LARGE", 100)
-        monkeypatch.setattr(sampling, "_TILE", 32)
+        monkeypatch.setattr(sampling, "_CACHED_NUMBERS", 100)
+        monkeypatch.setattr(sampling, "_TILE_SIDE", 32)
         result = one(given)
         monkeypatch.undo()
         assert result.dtype == dtype
@@ -67,8 +67,8 @@ def test_long_grids_are_neither_made_at_once_nor_kept(monkeypatch):
     one = ct.Warp(*pair(), fill=2.0)
     given = images(torch.uint8)
     expected, mask = one(given), one.valid_mask()
-    monkeypatch.setattr(plan, "_MOST_KEPT", 1000)
-    monkeypatch.setattr(plan, "_STRIP", 1000)
+    monkeypatch.setattr(plan, "_MOST_KEPT_PIXELS", 1000)
+    monkeypatch.setattr(plan, "_STRIP_PIXELS", 1000)
     long = ct.Warp(*pair(), fill=2.0)
     assert torch.equal(long(given), expected)
     assert torch.equal(long.valid_mask(), mask)
