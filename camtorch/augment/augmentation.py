@@ -30,7 +30,7 @@ from camtorch.values.module import typed_as
 from camtorch.warp.views import place_of
 from camtorch.warp.warp import Warp
 
-_FEW = 2 / 3  # of what an image shows of its own camera: with less than that, on average, it warns
+_LEAST_SHOWN = 2 / 3  # of what an image shows of its own camera: with less than that, on average, it warns
 _TRIES = 8
 _first = operator.itemgetter(0)
 
@@ -336,7 +336,7 @@ class Augmentation(SampleTransform):
             first = first[[0] * _TRIES] if first.batch_shape else first
             shares = filled(first, *self._new_camera(first, self._values_for(first, values)))
             most = filled(first, first, None)  # less than 1 if a fisheye shows a circle
-        if shares.mean() < _FEW * most.mean():
+        if shares.mean() < _LEAST_SHOWN * most.mean():
             warn(
                 f"{self._name}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
                 f"{1 - float(shares.min()):.0%}, as the camera of the images does not see so far. min_filled=0.9 zooms "

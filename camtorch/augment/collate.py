@@ -33,9 +33,9 @@ from camtorch.evaluate.tensors import in_worker
 from camtorch.native.memory import LIMIT, tensor_on
 from camtorch.values.arguments import is_list
 
-_SMALL = 1 << 16
+_LEAST_SHARED_BYTES = 1 << 16
 """Bytes below which a tensor goes within the message."""
-_MOST = 32
+_MOST_BLOCKS = 32
 """Blocks that wait, and blocks that others have: for those who keep more batches than that, memory is torch's own."""
 _HOME = 0  # the last byte of a block: this process may use it again
 _AWAY = 1  # another process has it
@@ -140,7 +140,7 @@ def _stacked(batch: Sequence[Tensor]) -> Tensor | None:
     if not in_worker() or any(t.dtype != first.dtype or not _is_plain(t) for t in batch):
         return None
     like = torch.empty(len(batch), *first.shape, dtype=first.dtype, device="meta")
-    if like.nbytes < _SMALL:
+    if like.nbytes < _LEAST_SHARED_BYTES:
         return torch.stack(list(batch)).as_subclass(_Sent)
     block = _block(like.nbytes)
     if block is None:
@@ -163,10 +163,10 @@ def _block(size: int) -> _Block | None:
         for i in reversed(range(len(_idle))):
             if _idle[i].size == size:
                 return _idle.pop(i)
-        while len(_idle) >= _MOST or sum(block.size for block in _idle) > LIMIT:
+        while len(_idle) >= _MOST_BLOCKS or sum(block.size for block in _idle) > LIMIT:
             del _idle[0]
     try:
-        return _Block(size) if len(_away) < _MOST else None
+        return _Block(size) if len(_away) < _MOST_BLOCKS else None
     except OSError:
         return None
 
@@ -192,7 +192,7 @@ def _reduced(sent: _Sent) -> tuple[Callable[..., Tensor], tuple[Any, ...]]:
         if block is not None and block.memory[-1] == _HOME:
             block.memory[-1] = _AWAY
             return _arrived, (os.getpid(), block.file, block.size, *what)
-        if sent.nbytes < _SMALL:
+        if sent.nbytes < _LEAST_SHARED_BYTES:
             return _unpacked, (sent.reshape(-1).view(torch.uint8).numpy().tobytes(), *what)
     reduced: tuple[Callable[..., Tensor], tuple[Any, ...]] = reduce_tensor(
         sent.detach().as_subclass(Tensor).clone().requires_grad_(sent.requires_grad)

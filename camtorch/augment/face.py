@@ -22,7 +22,7 @@ from camtorch.values.module import typed_as
 from camtorch.warp.views import pinhole
 from camtorch.warp.warp import Warp
 
-_ODD = 50.0  # times the distance: faces so much nearer or farther mean that units differ
+_ODD_RATIO = 50.0  # times the distance: faces so much nearer or farther mean that units differ
 
 
 class FaceNormalizer(SampleTransform):
@@ -112,7 +112,7 @@ class FaceNormalizer(SampleTransform):
                 f"the centre {centre[row].tolist()}"
             )
         scale = self.distance / distance.detach()
-        if known_false((scale < _ODD) & (scale > 1 / _ODD)):
+        if known_false((scale < _ODD_RATIO) & (scale > 1 / _ODD_RATIO)):
             at = ", ".join(f"{d:.4g}" for d in distance.flatten().tolist())
             raise ValueError(
                 f"{self._name}: distance must be in the unit of the poses; got {self.distance:g} for faces at {at}. "

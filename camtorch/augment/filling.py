@@ -20,8 +20,8 @@ from camtorch.warp.boxes import along_edges
 from camtorch.warp.moving import moved_pixels
 
 _ROOT = 1.324717957244746  # plastic number: a low-discrepancy sequence in 2D (R2)
-_CARE = 0.01  # largest error of the share that points measure
-_LESS = 0.9  # of the least field of view that was asked for: below that a warning says so
+_SHARE_ERROR = 0.01  # largest error of the share that points measure
+_LEAST_FOV_SHARE = 0.9  # of the least field of view that was asked for: below that a warning says so
 
 
 def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
@@ -79,7 +79,7 @@ def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float
 
 def with_care(share: float) -> float:
     """Return the share of points for which `share` of the image is surely filled."""
-    return min(share + _CARE, 1.0)
+    return min(share + _SHARE_ERROR, 1.0)
 
 
 def _shapes(
@@ -145,7 +145,7 @@ def tell_of_narrow_images(
     made = _across(zoomed).expand_as(factor)
     least = torch.minimum(_across(scaled(zoomed, 1 / factor)), torch.full_like(made, fov))
     # what cannot be filled at all has a warning of its own
-    less = (made < _LESS * least) & (factor > 1) & (found >= share)
+    less = (made < _LEAST_FOV_SHARE * least) & (factor > 1) & (found >= share)
     if not bool(less.any()):
         return
     TOLD.add(key)

@@ -18,7 +18,7 @@ from camtorch.rays.lattices import defined_or, movement, polar_rays, reach
 from camtorch.values.module import remade
 from camtorch.warp.boxes import along_edges
 
-_SMALL = 0.1  # decentering, prism and tilt, whose images are lopsided, move less than radial terms: as in real lenses
+_LOPSIDED_SHARE = 0.1  # decentering, prism and tilt move images by less than radial terms, as in real lenses
 _MOST_MEASURED = 64  # lenses whose measures are kept
 
 
@@ -86,7 +86,7 @@ def sensitivity(camera: Camera, distortion: Tensor, nominal: Tensor) -> Tensor:
     most = movement(camera, distortion, nominal).numpy()
     odd = camera.odd_in_x | camera.odd_in_y
     lopsided = np.array([name in odd for name in camera.distortion_names], bool)
-    share = np.where(lopsided, np.float32(_SMALL), np.float32(1)) / np.float32(max((~lopsided).sum(), 1))
+    share = np.where(lopsided, np.float32(_LOPSIDED_SHARE), np.float32(1)) / np.float32(max((~lopsided).sum(), 1))
     corner = math.hypot(*camera.size_for("the effect of its coefficients")) / 2
     return torch.from_numpy(share * np.where(most > 0, corner / most.clip(min=1e-30), 0.0)).to(distortion.device)
 

@@ -16,7 +16,7 @@ Grey = NDArray[np.uint8]
 
 _FEWEST = 6  # points that determine the pose of a board well
 _PIXELS = 3e6  # at most, of an image to search for chessboards; they are refined in the whole one
-_SMALL = 1.5e6  # pixels, below which an image is also searched for markers at twice the size
+_SMALL_PIXELS = 1.5e6  # an image of fewer is also searched for markers at twice the size
 _WINDOWS = (0.2, 0.3, 0.4)  # half the sides of windows around corners, in distances to the nearest corner
 _STRAY = 0.15  # such distances, from which a corner is too far from the place expected by its rows
 
@@ -135,7 +135,7 @@ def _passes(cv2: Any, grey: Grey, border: int = 1) -> list[tuple[Grey, int, Any]
     """Return images to search for markers, their scales, and the parameters; the most promising first."""
     low, high = np.percentile(grey, (2, 98))
     images = [(grey, 1)]
-    if grey.size < _SMALL:
+    if grey.size < _SMALL_PIXELS:
         images.insert(0, (cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 2))
     passes = []
     for margin in (0.1 * float(high - low), 7.0):  # one that separates shapes that nearly touch, and OpenCV's own

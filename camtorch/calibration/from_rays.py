@@ -21,7 +21,7 @@ from camtorch.values.threads import on_one_thread
 # of unified lenses to try first: 0 is perspective, 1/2 stereographic, 0.65 nearly equidistant
 _ALPHAS = (0.0, 0.35, 0.5, 0.6, 0.65, 0.75)
 _NEAREST = 0.05  # the least divisor of a unified lens, for unit rays, of points that count in the first fit
-_LEAST = 4  # rays
+_FEWEST_RAYS = 4
 
 
 @on_one_thread
@@ -110,10 +110,10 @@ def fit(
     unit = torch.where(good, flat_rays / torch.where(good, lengths, 1.0), axis)
     seen = fitting.Observations(unit, torch.where(good, flat_pixels, 0.0), flat_weights)
     counts = seen.weights > 0
-    if not counts.numel() or not bool((counts.sum(-1) >= _LEAST).all()):
+    if not counts.numel() or not bool((counts.sum(-1) >= _FEWEST_RAYS).all()):
         raise ValueError(
-            f"{owner}: rays must have at least {_LEAST} finite rows a camera; got {counts.sum(-1).tolist()} of rays "
-            f"{tuple(given_rays.shape)}"
+            f"{owner}: rays must have at least {_FEWEST_RAYS} finite rows a camera; got {counts.sum(-1).tolist()} "
+            f"of rays {tuple(given_rays.shape)}"
         )
     lens = _fit_unified(seen, owner)
     slopes = views.focal_at_axis(lens)

@@ -23,7 +23,7 @@ from camtorch.values.arguments import Numbers, as_number, broadcast_shapes, hint
 from camtorch.values.module import model_of, remade
 from camtorch.values.threads import on_one_thread
 
-_FEW = 5  # points, which may have minima far from their start
+_FEW_POINTS = 5  # which may have minima far from their start
 _WORSE = 4.0  # times the least cost: a start below that may lead to less
 _MOVE = 1e-6  # of rays, the step of finite differences
 _THIN = 0.1  # of the extent of points: thinner ones may have the minima of a plane
@@ -263,7 +263,7 @@ def _solve_anywhere(given: _Given, threshold: float | None) -> Solved:
         )
         mirrored = across_sight @ found.rotations @ in_plane
         turns, shifts = mirrored, middle - (mirrored @ centre[..., None])[..., 0]
-        few = ~starts.valid[:, 1] & ((weights > 0).sum(-1) <= _FEW)
+        few = ~starts.valid[:, 1] & ((weights > 0).sum(-1) <= _FEW_POINTS)
         near = 2 * task.cost(torch.cat((rotation_vector(turns), shifts), -1)) <= _WORSE * found.costs
         flat = flat & torch.isfinite(found.costs) & (few | near)
         if bool(flat.any()):

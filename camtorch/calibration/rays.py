@@ -16,7 +16,7 @@ from camtorch.poses.rotations import nearest_rotation, small_turn
 _PAIRS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # where a symmetric matrix's entries are among its six numbers
 _FLAT = 1e-6  # of the points' extent: less counts as flat
 _SAME = 0.02  # radians between two rotations that are one minimum
-_STARTS, _FEW, _STEPS = 12, 4, 8  # rotations to start from, those continued, and steps
+_STARTS, _CONTINUED, _STEPS = 12, 4, 8  # rotations to start from, those continued, and steps
 _LEAST, _TINY = 1e-15, 1e-300  # added to divisors
 
 
@@ -230,7 +230,7 @@ def _rotations_in_space(local: Tensor, rays: Tensor, weights: Tensor, distances:
         return torch.where(distances.depths(rotations) > 0, distances.of_rotations(rotations), torch.inf)
 
     # four points have up to four minima near each other, which two steps do not separate
-    few = _STARTS if bool(((weights > 0).sum(-1) <= 4).any()) else _FEW
+    few = _STARTS if bool(((weights > 0).sum(-1) <= 4).any()) else _CONTINUED
     for count, steps in ((_STARTS, 2), (few, _STEPS)):
         rotations = distances.descended(_take(rotations, costs(rotations).argsort(-1)[:, :count]), steps)
     cost = costs(rotations)

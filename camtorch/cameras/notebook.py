@@ -11,8 +11,8 @@ from camtorch.projection.camera_like import CameraLike
 
 _WIDTH = 260  # px of the image
 _CELLS = 48  # along the wider side of the lattice that finds pixels without rays
-_STEPS = 96  # points around a circle
-_FEW = 7  # circles are enough
+_CIRCLE_POINTS = 96
+_ENOUGH_CIRCLES = 7
 
 
 @torch.no_grad()
@@ -31,8 +31,8 @@ def as_html(camera: CameraLike) -> str:
     blind = "".join(f"M{i * side:.1f} {j * side:.1f}{cell}" for j, i in (~seen).nonzero().tolist())
     shapes = [f'<path d="{blind}" fill="#8888" stroke="none"/>']
     most = math.degrees(float(rays[..., 2][seen].clamp(-1, 1).acos().max())) if bool(seen.any()) else 0.0
-    step = next((s for s in (1, 2, 5, 10, 15) if most / s < _FEW), 30)
-    turn = torch.linspace(0, 2 * math.pi, _STEPS + 1, dtype=torch.float64)
+    step = next((s for s in (1, 2, 5, 10, 15) if most / s < _ENOUGH_CIRCLES), 30)
+    turn = torch.linspace(0, 2 * math.pi, _CIRCLE_POINTS + 1, dtype=torch.float64)
     for angle in range(step, int(most) + 1, step):
         theta = torch.full_like(turn, math.radians(angle))
         circle = torch.stack((theta.sin() * turn.cos(), theta.sin() * turn.sin(), theta.cos()), -1)

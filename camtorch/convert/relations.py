@@ -14,7 +14,7 @@ Model = type[CameraLike]
 Models = Mapping[str, Model]
 Step = tuple[Model, Mapping[str, str]]  # a model, and its names by the names before; coefficients without one are lost
 
-_MANY = 33  # more coefficients are not compared
+_MOST_COEFFICIENTS = 33  # more are not compared
 
 
 def default_count(model: Model, source: CameraLike, models: Models) -> int:
@@ -24,7 +24,7 @@ def default_count(model: Model, source: CameraLike, models: Models) -> int:
     if (steps := _path(type(source), model, models)) is None:
         return model.fit_counts[0] if model.fit_counts else model.default_count
     needed = {_carried(source, name, steps)[0] for name in source.distortion_names}
-    named = {n: model.names_of(n) for n in range(model.default_count, _MANY)}
+    named = {n: model.names_of(n) for n in range(model.default_count, _MOST_COEFFICIENTS)}
     held = {n: len(needed & set(names)) for n, names in named.items() if names}
     return min((n for n, number in held.items() if number == max(held.values())), default=model.default_count)
 
@@ -81,5 +81,7 @@ def _carried(source: CameraLike, name: str, steps: list[Step]) -> tuple[str | No
 
 
 def _all_names(model: Model) -> tuple[str, ...]:
-    """Return the names of the most coefficients that the model takes, fewer than `_MANY`."""
-    return max((names for names in map(model.names_of, range(_MANY)) if names is not None), key=len, default=())
+    """Return the names of the most coefficients that the model takes, fewer than `_MOST_COEFFICIENTS`."""
+    return max(
+        (names for names in map(model.names_of, range(_MOST_COEFFICIENTS)) if names is not None), key=len, default=()
+    )

@@ -13,8 +13,8 @@ from camtorch.evaluate.door import keeps_graph, outside_inference
 from camtorch.evaluate.kept import mark
 from camtorch.evaluate.tensors import is_unknown
 
-_ALIGNED = 16  # bytes: where the numbers of any dtype may begin
-_MOST = 64  # tensors
+_ALIGNMENT_BYTES = 16  # where the numbers of any dtype may begin
+_MOST_TENSORS = 64
 
 _known: dict[tuple[Any, ...], tuple[Tensor, Tensor]] = {}
 """Mark of a tensor, which edits in place change -> the tensor, so that its memory stays, and its values on the CPU."""
@@ -50,7 +50,7 @@ def remember(tensor: Tensor, values: Tensor) -> Tensor:
     """Have `on_cpu` find the values of a tensor, on the CPU, without asking its device."""
     if not (tensor.is_cpu or tensor.is_inference()):
         _known[_key(tensor)] = tensor.detach(), values.detach().contiguous()
-    while len(_known) > _MOST:
+    while len(_known) > _MOST_TENSORS:
         _known.pop(next(iter(_known)), None)
     return values
 
@@ -61,7 +61,7 @@ def _key(tensor: Tensor) -> tuple[Any, ...]:
 
 def sent(tensors: Sequence[Tensor], device: torch.device) -> list[Tensor]:
     """Return tensors of the CPU on another device: by one copy, for which nobody waits."""
-    starts = [0, *accumulate(-(-t.nbytes // _ALIGNED) * _ALIGNED for t in tensors)]
+    starts = [0, *accumulate(-(-t.nbytes // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES for t in tensors)]
     places = [slice(start, start + t.nbytes) for start, t in zip(starts, tensors, strict=False)]
     with outside_inference():
         # copies from other memory wait for what the device has still to do

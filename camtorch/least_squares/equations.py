@@ -25,7 +25,7 @@ class Equations(NamedTuple):
 
 
 _NOTHING = 1e-20  # of a column's squares: the rounding left of a column that is a sum of others
-_FEW = 64  # shared unknowns, up to which native code is faster than LAPACK
+_FEW_UNKNOWNS = 64  # shared ones, up to which native code is faster than LAPACK
 _FIRM = 1e-4  # of the largest singular value: smaller ones belong to unknowns that the data hardly determine
 
 
@@ -67,7 +67,12 @@ class System:
     def step(self, damping: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """Return steps of the views (R, V, L) and of shared unknowns (R, G), and the linear cost's decrease (R,)."""
         view, shared, width = self.equations.view, self.equations.shared, self.width
-        if library() is not None and shared.is_cpu and shared.dtype == torch.float64 and shared.shape[-1] <= _FEW:
+        if (
+            library() is not None
+            and shared.is_cpu
+            and shared.dtype == torch.float64
+            and shared.shape[-1] <= _FEW_UNKNOWNS
+        ):
             return self._compiled_step(damping)
         squares = view[..., :-1].square().sum(-2)
         root = damping.sqrt()

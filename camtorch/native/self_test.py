@@ -10,7 +10,7 @@ from ctypes import addressof as at
 from camtorch.native import structs
 from camtorch.native.structs import CELL_CUBIC, Library
 
-_NEAR = 1e-9
+_ROUNDING = 1e-9
 Answer = tuple[Iterable[float], Iterable[float]]
 """What a call gave, and what it should have given."""
 
@@ -19,7 +19,7 @@ def wrong(library: Library) -> str | None:
     """Return the name of a call that gives another answer than it should, or None if all are right."""
     for name, answer in ANSWERS.items():
         given, known = answer(library, Numbers())
-        if not all(abs(a - b) < _NEAR for a, b in zip(given, known, strict=True)):
+        if not all(abs(a - b) < _ROUNDING for a, b in zip(given, known, strict=True)):
             return name
     return None
 

@@ -21,7 +21,7 @@ from camtorch.evaluate.tensors import may_branch_on
 # a first derivative accurate to 1e-13 of the function's own scale.
 _SMALL_ANGLE2 = 1e-2
 _SMALL_SLOPE2 = 1e-3
-_MANY = 1000  # values of which the small ones are taken out
+_MANY_VALUES = 1000  # of which the small ones are taken out
 
 
 def _series(t: Tensor, coefficients: list[float]) -> Tensor:
@@ -43,7 +43,7 @@ def _blend(
 
     `in_near` and `in_far`: harmless inputs where the other branch counts; None leaves the plane.
     """
-    looks = may_branch_on(small, *planes) and small.numel() > _MANY
+    looks = may_branch_on(small, *planes) and small.numel() > _MANY_VALUES
     places = small.nonzero(as_tuple=True) if looks else ()
     if looks and not len(places[0]):
         return far(*planes)

@@ -13,7 +13,7 @@ from camtorch.native.structs import NEARLY_ROTATION
 from camtorch.optics.special import angle_per_radius, cos_root, cosc_root, sinc_root
 from camtorch.values.arguments import Numbers, as_real, as_rows, as_values, check_devices
 
-_FEW = 16  # matrices that plain numbers check faster than operators of torch do
+_FEW_MATRICES = 16  # that plain numbers check faster than operators of torch do
 
 
 def rotation_matrix(rotation: Tensor) -> Tensor:
@@ -139,7 +139,9 @@ def is_right(matrix: Tensor) -> bool:
 
     False for more than a few, and if values may not be read.
     """
-    if not (matrix.dtype in (torch.float32, torch.float64) and matrix.numel() <= 9 * _FEW and are_free(matrix)):
+    if not (
+        matrix.dtype in (torch.float32, torch.float64) and matrix.numel() <= 9 * _FEW_MATRICES and are_free(matrix)
+    ):
         return False
     for (a, b, c), (d, e, f), (g, h, i) in [matrix.tolist()] if matrix.ndim == 2 else matrix.tolist():
         squares = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i

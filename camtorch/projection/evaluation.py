@@ -21,8 +21,8 @@ from camtorch.projection.camera_like import CameraLike
 from camtorch.projection.rows import CameraRows, Direction, unusable
 from camtorch.values.arguments import Numbers, as_points, present, warn
 
-_MANY = 1_000_000  # points: a call of as many is so slow without the library that it warns
-_BLOCK = 1 << 17  # points of all cameras, for each thread
+_MANY_POINTS = 1_000_000  # a call of as many is so slow without the library that it warns
+_BLOCK_POINTS = 1 << 17  # of all cameras, for each thread
 
 if TYPE_CHECKING:
     from camtorch.projection.native_cameras import Native
@@ -81,13 +81,13 @@ def evaluate_rows(
             return planes, valid
         planes, valid, *_ = direction.native(made, rows.detach())
         return planes, valid
-    if way.is_native and rows.shape[0] * rows.shape[1] >= _MANY:
+    if way.is_native and rows.shape[0] * rows.shape[1] >= _MANY_POINTS:
         warn_if_missing()
     formula = partial(direction.formula, model)
-    if known is None or rows.shape[0] * rows.shape[1] <= _BLOCK or not are_free(*inputs):
+    if known is None or rows.shape[0] * rows.shape[1] <= _BLOCK_POINTS or not are_free(*inputs):
         return formula(*inputs, known, way.order)
     # block by block, which stay in a cache from one operation to the next
-    step = max(_BLOCK * torch.get_num_threads() // len(rows), 1)
+    step = max(_BLOCK_POINTS * torch.get_num_threads() // len(rows), 1)
     planes = rows.new_empty(direction.size_out, *rows.shape[:2])
     valid = torch.empty(planes.shape[1:], dtype=torch.bool, device=planes.device)
     for i in range(0, rows.shape[1], step):

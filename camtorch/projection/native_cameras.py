@@ -228,13 +228,13 @@ def _same_ends(end: float, cameras: int) -> ctypes.Array[c_double]:
     return (c_double * cameras)(*[end] * cameras)
 
 
-_LONGEST = 512  # the most coefficients of lenses that are kept
+_MOST_COEFFICIENTS = 512  # of lenses that are kept
 _lenses = Kept(24)
 
 
 def lenses_of(plan: ModelPlan, k: Tensor, make: Callable[[], Lenses]) -> Lenses:
     """Return the lenses of coefficients (C, n): one of the last ones used, or new ones."""
-    if k.numel() > _LONGEST:
+    if k.numel() > _MOST_COEFFICIENTS:
         return make()
     return _lenses((), (plan, k.dtype, k.shape, k.numpy().tobytes()), make)
 

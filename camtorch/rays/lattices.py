@@ -22,7 +22,7 @@ CameraT = TypeVar("CameraT", bound=CameraLike)
 
 AXES = ("horizontal", "vertical", "diagonal")  # of an image, along which a field of view is measured
 
-_LINE = 513  # points along a line of the image
+_LINE_POINTS = 513
 _STEP = 1e-4  # of a coefficient
 
 
@@ -174,7 +174,7 @@ def field_of_view(camera: CameraLike) -> Tensor:
     start, along = ends[..., None, :2], ends[..., None, 2:] - ends[..., None, :2]
     least = precise(start).new_full(start.shape[:-2], torch.inf)
     most = -least
-    share = torch.linspace(0, 1, _LINE).to(start).expand(*least.shape, _LINE)
+    share = torch.linspace(0, 1, _LINE_POINTS).to(start).expand(*least.shape, _LINE_POINTS)
     for _ in range(4):  # the whole line, then closer around the ends of its visible part
         rays, valid = camera.unproject(start + share[..., None] * along)
         x, y, z = precise(rays).unbind(-1)
@@ -205,12 +205,12 @@ def focal_for(camera: CameraLike, fov: Tensor, image_size: tuple[int, int], axis
         angles = angles_from_axis(rays).sum(-1).amax(-1)
         return torch.where(valid.flatten(-2).all(-1), angles, torch.inf)
 
-    share = torch.linspace(0, 1, _LINE).to(fov)
+    share = torch.linspace(0, 1, _LINE_POINTS).to(fov)
     reach = half.norm(dim=-1).amax()
     low, high = fov.new_full(fov.shape, 1e-6), fov.new_full(fov.shape, 1e5)
     scale = low[..., None] * (high / low)[..., None] ** share / reach
     for _ in range(5):  # the first in even ratios, the others in even steps
-        below = (angle(scale) < fov[..., None]).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _LINE - 1)
+        below = (angle(scale) < fov[..., None]).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _LINE_POINTS - 1)
         low, high = scale.gather(-1, below - 1), scale.gather(-1, below)
         scale = low + (high - low) * share
     found = angle(torch.cat((low, high), -1))

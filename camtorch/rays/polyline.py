@@ -9,10 +9,10 @@ from camtorch.poses.extrinsics import Extrinsics
 from camtorch.projection.camera_like import CameraLike
 from camtorch.values.arguments import Numbers, as_points
 
-_FIRST = 32  # pieces of an edge, of equal angles, before any is divided
-_LONGEST, _NEAR = 20.0, 0.05  # px: between points, and from a piece to its curve
-_SMALLEST = 1e-11  # of an edge's angle: the least piece, at which it is cut
-_FARTHEST = 16.0  # times the image: a pinhole's pixels grow without limit towards 90 degrees from its axis
+_FIRST_PIECES = 32  # of an edge, of equal angles, before any is divided
+_LONGEST_STEP, _MOST_SAG = 20.0, 0.05  # px: between points, and from a piece to its curve
+_LEAST_PIECE = 1e-11  # of an edge's angle: there it is cut
+_FARTHEST_IMAGES = 16.0  # a pinhole's pixels grow without limit towards 90 degrees from its axis
 
 
 def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics | None) -> list[Tensor]:
@@ -33,17 +33,19 @@ def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics
     edges = _Edges(points.double())
     # the middle of the image, and the distance from it at which curves end
     intrinsics = camera.intrinsics.detach().double()
-    middle, reach = intrinsics[2:], _FARTHEST * float(intrinsics[:2].max())
+    middle, reach = intrinsics[2:], _FARTHEST_IMAGES * float(intrinsics[:2].max())
     if camera.image_size is not None:
         height, width = camera.image_size
-        middle, reach = middle.new_tensor([width / 2, height / 2]), _FARTHEST * max(height, width)
+        middle, reach = middle.new_tensor([width / 2, height / 2]), _FARTHEST_IMAGES * max(height, width)
 
     def seen(places: Tensor) -> tuple[Tensor, Tensor]:
         pixels, valid = camera.project(edges.at(places))
         return pixels, valid & ((pixels - middle).norm(dim=-1) < reach)
 
     with torch.no_grad():
-        places = torch.linspace(0, edges.count, _FIRST * edges.count + 1, dtype=torch.float64, device=points.device)
+        places = torch.linspace(
+            0, edges.count, _FIRST_PIECES * edges.count + 1, dtype=torch.float64, device=points.device
+        )
         for _ in range(60):
             pixels, valid = seen(places)
             both = valid[1:] & valid[:-1]
@@ -55,13 +57,13 @@ def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics
                 offset = seen(start + share * step)[0] - pixels[:-1]
                 across = (chord[:, 0] * offset[:, 1] - chord[:, 1] * offset[:, 0]).abs()
                 away = torch.maximum(away, torch.where(length > 0, across / length.clamp(min=1e-30), 0.0))
-            divided = torch.where(both, (length > _LONGEST) | (away > _NEAR), valid[1:] != valid[:-1])
-            divided &= step > _SMALLEST * edges.count
+            divided = torch.where(both, (length > _LONGEST_STEP) | (away > _MOST_SAG), valid[1:] != valid[:-1])
+            divided &= step > _LEAST_PIECE * edges.count
             if not bool(divided.any()):
                 break
             places = torch.cat((places, (start + step / 2)[divided])).sort().values
         # the ends of a piece that remains longer belong to two curves, like those at the seam of a panorama
-        linked = both & (length <= _LONGEST)
+        linked = both & (length <= _LONGEST_STEP)
         ends = torch.cat((linked.new_zeros(1), linked)) != torch.cat((linked, linked.new_zeros(1)))
         runs = ends.nonzero()[:, 0].reshape(-1, 2).tolist()
     return [camera.project(edges.at(places[a : b + 1]))[0].to(points.dtype) for a, b in runs]

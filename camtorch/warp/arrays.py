@@ -26,7 +26,7 @@ class Picture(Protocol):
 
 
 Image = TypeVar("Image", bound=Tensor | np.ndarray[Any, Any] | Picture)
-_FEW = 4  # channels
+_FEW_CHANNELS = 4
 
 
 def as_tensor(array: object, name: str, owner: str) -> Tensor:
@@ -41,7 +41,7 @@ def as_tensor(array: object, name: str, owner: str) -> Tensor:
         dtype = array.dtype.newbyteorder("=") if array.itemsize <= 8 else np.dtype(np.float64)
         array, given = np.empty(array.shape, dtype), array
         # channel by channel is three times as fast for pixels or channels that run backwards
-        apart = given.ndim == 3 and given.shape[-1] <= _FEW
+        apart = given.ndim == 3 and given.shape[-1] <= _FEW_CHANNELS
         for at in [(..., channel) for channel in range(given.shape[-1])] if apart else [...]:
             array[at] = given[at]
     elif not array.flags.writeable:  # torch warns about read-only memory, which is only read here

@@ -11,8 +11,8 @@ from camtorch.native.structs import EDGE_POINTS
 from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes
 from camtorch.warp.plan import CameraPair
 
-_ROUNDED = 1e-3  # pixels from a panorama's edges, where rounding would cost rays
-_LATTICE = 16  # steps across and down the target, between points that are tested against a polygon
+_ROUNDED_PIXELS = 1e-3  # from a panorama's edges, where rounding would cost rays
+_LATTICE_STEPS = 16  # across and down the target, between points that are tested against a polygon
 
 
 def moved_boxes(warp: CameraPair, boxes: Numbers) -> tuple[Tensor, Tensor]:
@@ -61,9 +61,9 @@ def _inside(warp: CameraPair, corners: Tensor, like: Tensor) -> tuple[Tensor, Te
     """Return a lattice (N, 2) over the target, and whether (B, *M, N) polygons enclose the scene at its points."""
     height, width = warp.target.size_for("Warp")
     host, device = warp.host, like.device
-    share = torch.linspace(0, 1, _LATTICE + 1, dtype=like.dtype, device="cpu" if host else device)
+    share = torch.linspace(0, 1, _LATTICE_STEPS + 1, dtype=like.dtype, device="cpu" if host else device)
     if warp.target.turn_axis is not None:
-        share = share.clamp(_ROUNDED / height, 1 - _ROUNDED / height)
+        share = share.clamp(_ROUNDED_PIXELS / height, 1 - _ROUNDED_PIXELS / height)
     lattice = torch.cartesian_prod(share * width, share * height) - 0.5
     with torch.no_grad():
         shown, seen = (host or warp).move(lattice.expand(*warp.batch_shape, *lattice.shape), back=True)

@@ -19,7 +19,7 @@ from camtorch.native import sampler
 from camtorch.native.library import native_available
 from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_QUINTIC, OUTSIDE, STEP
 
-_BLOCK = 128  # pixels that one product interpolates: wider ones multiply with more zeros
+_BLOCK_PIXELS = 128  # that one product interpolates: wider ones multiply with more zeros
 _kept_weights = Kept(4)  # those of `_weights`
 
 
@@ -211,7 +211,7 @@ def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
     terms = (nodes[:, :, i : i + rows, None] * weights[:, i, None] for i in range(taps))
     lines = reduce(torch.add, terms).flatten(0, 3).to(wide)
     result = lines.new_empty(len(lines), columns * STEP)
-    cells = _BLOCK // STEP
+    cells = _BLOCK_PIXELS // STEP
     with torch.autocast(nodes.device.type, enabled=False):
         for first in range(0, columns, cells):
             n = min(cells, columns - first)
@@ -229,7 +229,7 @@ def _weights(taps: int, dtype: torch.dtype, wide: torch.dtype, device: torch.dev
     """Return weights (8, taps) of nodes at the pixels of a cell, and the matrix that has these for a block of cells."""
     t, at = torch.arange(STEP, dtype=torch.float64, device=device) / STEP, range(1 - taps // 2, taps // 2 + 1)
     parts = [math.prod(((t - m) / (k - m) for m in at if m != k), start=torch.ones_like(t)) for k in at]
-    weights, cells = torch.stack(parts, -1).to(dtype), _BLOCK // STEP
+    weights, cells = torch.stack(parts, -1).to(dtype), _BLOCK_PIXELS // STEP
     spread = weights.new_zeros(cells + taps - 1, cells, STEP, dtype=wide)
     for cell in range(cells):
         spread[cell : cell + taps, cell] = weights.T

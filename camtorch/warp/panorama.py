@@ -12,8 +12,8 @@ from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import values_of
 from camtorch.values.module import remade
 
-_NEAR = 0.05  # pixels by which a whole turn may miss the edges: a focal length of two decimals misses by 0.03
-_RIM = 16  # pixels beyond an edge: bicubic samples of images halved three times read so far
+_MOST_GAP = 0.05  # pixels by which a whole turn may miss the edges: a focal length of two decimals misses by 0.03
+_RIM_PIXELS = 16  # beyond an edge: bicubic samples of images halved three times read so far
 
 
 class Seam(NamedTuple):
@@ -68,20 +68,20 @@ def seam_of(camera: Camera) -> Seam | None:
 def _found(camera: Camera, axis: int, numbers: Tensor) -> Seam | None:
     sides = camera.size_for("Warp")[::-1]
     side, other = sides[axis], sides[1 - axis]
-    if not len(numbers) or not bool(((math.tau * numbers[:, axis] - side).abs() < _NEAR).all()):
+    if not len(numbers) or not bool(((math.tau * numbers[:, axis] - side).abs() < _MOST_GAP).all()):
         return None
     # the model has pixels for half a turn to either side of its principal point, which may lie anywhere
     low, high = (float(end) - (side - 1) / 2 for end in torch.aminmax(numbers[:, 2 + axis]))
     beyond = [math.ceil(max(end, 0.0)) for end in (-low, high)]
     if max(beyond) > side:
         return None
-    rims = [end + min(_RIM, side - end) for end in beyond]
+    rims = [end + min(_RIM_PIXELS, side - end) for end in beyond]
     poles = [0, 0]
     if camera.has_poles:
         focal, centre = numbers[:, 1 - axis], numbers[:, 3 - axis]
         for i, (edge, pole) in enumerate(((-0.5, -math.pi / 2), (other - 0.5, math.pi / 2))):
-            if bool(((edge - centre - pole * focal).abs() < _NEAR).all()):
-                poles[i] = min(_RIM, other)
+            if bool(((edge - centre - pole * focal).abs() < _MOST_GAP).all()):
+                poles[i] = min(_RIM_PIXELS, other)
     first, second = (rims, poles) if axis == 0 else (poles, rims)
     return Seam(axis, (first[0], first[1], second[0], second[1]))
 
@@ -91,7 +91,7 @@ def goes_round(camera: Camera) -> tuple[int, Tensor] | None:
     if (axis := camera.turn_axis) is None or (numbers := values_of(camera.intrinsics)) is None:
         return None
     numbers, side = numbers.reshape(-1, 4), camera.size_for("Warp")[1 - axis]
-    return (axis, numbers) if bool((math.tau * numbers[:, axis] < side + _NEAR).all()) else None
+    return (axis, numbers) if bool((math.tau * numbers[:, axis] < side + _MOST_GAP).all()) else None
 
 
 def lengths(camera: Camera, steps: tuple[Tensor, Tensor], grid: tuple[Tensor, Tensor]) -> Tensor:

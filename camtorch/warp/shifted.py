@@ -18,7 +18,7 @@ from camtorch.warp.options import PaddingMode
 from camtorch.warp.warp import Warp
 
 _STEPS = 12  # of the search along a ray
-_CLOSE = 1e-4  # of the distance: a ray this close has met a surface
+_MEETING_DISTANCE = 1e-4  # of the distance: a ray this close has met a surface
 _EDGE = 0.05  # of the distance: neighbours that differ by more are two surfaces
 _MOST_GAPS = 8  # px between former neighbours in an image that is enlarged
 
@@ -127,7 +127,7 @@ class ShiftedWarp(Warp):
             pixels, mapped = source.project(at)
             there = _between(self.distance[i : i + 1], pixels[None])[0]
             off = there - _length(at)
-            met = mapped & (there > 0) & (off.abs() < _CLOSE * there)
+            met = mapped & (there > 0) & (off.abs() < _MEETING_DISTANCE * there)
             seen[left], good[left] = pixels, met
             more = (~met & (there > 0)).nonzero()[:, 0]
             if not len(more):

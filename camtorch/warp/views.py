@@ -37,7 +37,7 @@ __all__ = ["FACES", "Views", "crop_place", "cube", "look_at", "ring"]
 
 FACES = ("front", "right", "back", "left", "up", "down")
 """Names of a cube's faces, as the camera sees them from within; its axis goes through the middle of the front."""
-_ALONG = 65  # samples of a box's edge, and then of the steps to either side of the farthest sample
+_EDGE_SAMPLES = 65  # of a box's edge, and then of the steps to either side of the farthest sample
 _ROUNDS = 3  # of such samples: 2e-6 of an edge
 _MORE_ROUNDS = 8  # if a lens ends on the outline, where slopes may grow without bounds
 _VIRTUAL = Pinhole([1.0, 1.0, 0.0, 0.0]).detach()
@@ -382,7 +382,7 @@ def _outermost(
     corners = corners_of(torch.cat((low - moved, high + moved), -1))
     start, edge = corners[:, :, None, None], (corners.roll(-1, 1) - corners)[:, :, None, None]
     # find the largest slopes x / z and y / z along each edge, in smaller and smaller steps
-    steps = torch.linspace(-1, 1, _ALONG, dtype=low.dtype, device=low.device)
+    steps = torch.linspace(-1, 1, _EDGE_SAMPLES, dtype=low.dtype, device=low.device)
     place, half, all_seen = low.new_full((len(low), 4, 1), 0.5), 0.5, True
     farthest = low.new_full((len(low), 2), -math.inf)
     for i in range(_MORE_ROUNDS):
@@ -400,7 +400,7 @@ def _outermost(
         is_last = i == _MORE_ROUNDS - 1 or (i == _ROUNDS - 1 and all_seen)
         if is_last and not learns:
             break
-        place, half = share.expand(*best.shape, -1).gather(-1, index[..., None])[..., 0], 2 * half / (_ALONG - 1)
+        place, half = share.expand(*best.shape, -1).gather(-1, index[..., None])[..., 0], 2 * half / (_EDGE_SAMPLES - 1)
         if is_last:
             break
     _refuse(~torch.isfinite(farthest).all(-1), boxes, "have an outline that the lens sees", owner)

@@ -9,7 +9,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import as_values
 from camtorch.warp.warp import as_sized
 
-_LEAST = 0.1  # a cosine: from 84 degrees on the light is constant
+_LEAST_COSINE = 0.1  # from 84 degrees on the light is constant
 
 
 def vignetting(camera: Camera, power: float | Tensor = 1.0) -> Tensor:
@@ -30,7 +30,7 @@ def vignetting(camera: Camera, power: float | Tensor = 1.0) -> Tensor:
     height, width = as_sized(camera, "camera", "vignetting").size_for("vignetting")
     with torch.no_grad():
         rays, valid = camera.rays()
-        cosine = torch.where(valid, rays[..., 2], _LEAST).reshape(-1, 1, height, width).clamp(_LEAST, 1.0)
+        cosine = torch.where(valid, rays[..., 2], _LEAST_COSINE).reshape(-1, 1, height, width).clamp(_LEAST_COSINE, 1.0)
     if isinstance(power, (int, float)):
         power = cosine.new_tensor(power)
     power = as_values(power, "power", "vignetting").to(cosine)
