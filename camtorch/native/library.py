@@ -87,9 +87,7 @@ def warn_if_missing() -> None:
 def loaded() -> Library:
     """Return the library, for calls that are made only if there is one."""
     if (found := library()) is None:
-        raise RuntimeError(
-            f"camtorch: the compiled library must be there for compiled calls; got none: it is {state()}"
-        )
+        raise RuntimeError(f"camtorch: the library must be there for compiled calls; got none: it is {state()}")
     return found
 
 

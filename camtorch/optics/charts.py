@@ -46,7 +46,6 @@ class Chart:
     """The code in native/structs.py, which a class states for itself, not for subclasses. None: only Python has it."""
     has_scale = True
     """Whether the plane point is (x, y) times a `scale`."""
-
     parameters: tuple[Tensor, ...] = ()
     """The learnable parts of the formulas: columns that broadcast against planes.
 
@@ -57,14 +56,13 @@ class Chart:
         """Return a margin, positive for rays that have a point."""
         raise NotImplementedError
 
-    def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor | None:
-        """Return the factor by which (x, y) become the plane point, or None if the chart does more; see `to_plane`."""
-        return None
+    def scale(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Tensor:
+        """Return the factor by which (x, y) become the plane point; see `to_plane`, which other charts override."""
+        raise NotImplementedError
 
     def to_plane(self, x: Tensor, y: Tensor, z: Tensor, order: int = 2) -> Planes2:
         """Return the plane point of covered rays; derivatives up to that order must be exact, on the axis too."""
         scale = self.scale(x, y, z, order)
-        assert scale is not None  # a chart without one overrides `to_plane`
         return x * scale, y * scale
 
     def on_plane(self, a: Tensor, b: Tensor) -> Tensor:
@@ -189,7 +187,6 @@ class CylinderChart(Chart):
     """(longitude, height) = (atan2(x, z), y / hypot(x, z)): covers every ray but straight up and down."""
 
     code: ClassVar[int | None] = CYLINDER
-
     has_scale = False
 
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
@@ -209,7 +206,6 @@ class SphereChart(Chart):
     """(longitude, latitude) = (atan2(x, z), atan2(y, hypot(x, z))): covers every ray but straight up and down."""
 
     code: ClassVar[int | None] = SPHERE
-
     has_scale = False
 
     def margin(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:

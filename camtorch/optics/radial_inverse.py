@@ -256,8 +256,7 @@ class RadialInverse:
         if self._table is not None:
             safe_radius_sq = self.safe_radius_sq.reshape(-1, 1)
             return _scale(self.factor.name, self.k, safe_radius_sq, self._table, rows).view_as(r2)
-        found = _inverse_of(self.factor.name, self.k, self.end, rows)[0]
-        return found.view_as(r2)
+        return _inverse_of(self.factor.name, self.k, self.end, rows)[0].view_as(r2)
 
 
 _tables = Kept(8)

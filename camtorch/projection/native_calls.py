@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from ctypes import Array, addressof, c_int64
 from itertools import accumulate
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -37,16 +37,11 @@ def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
     return pixels, valid
 
 
-class Unprojected(NamedTuple):
-    """Unit rays (3, C, N), whether they exist (C, N), and points on the chart's plane (2, C, N), if needed."""
+def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return unit rays (3, C, N) of pixels (C, N, 2), and whether they exist (C, N).
 
-    rays: Tensor
-    valid: Tensor
-    solution: Tensor | None
-
-
-def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojected:
-    """Return rays of pixels (C, N, 2), and if `keeps`, also the results that `unproject_vjp` needs."""
+    And, if `keeps`, the points on the chart's plane (2, C, N) that `unproject_vjp` needs.
+    """
     cameras, count, _ = pixels.shape
     rays = _empty((3, cameras, count), native.dtype)
     valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
@@ -57,7 +52,7 @@ def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> Unprojecte
     call.results, call.result_strides[:] = rays.data_ptr(), (count, 1, cameras * count)
     call.solution, call.direction = address(solution), structs.UNPROJECT
     _call_and_follow(native, cameras, count, call)
-    return Unprojected(rays, valid, solution)
+    return rays, valid, solution
 
 
 def project_vjp(

@@ -42,10 +42,7 @@ class CameraRows:
         self._same_on_cpu = None if known is None else CameraRows(model, known[0], known[1])
         self.notes = note(intrinsics), note(distortion)
         first, second = (then if mark is None else then.clone() for then, mark in self.notes)
-        values = first, second
-        if intrinsics.ndim == 1:
-            values = values[0][None], values[1][None]
-        self.given = values
+        self.given = values = (first[None], second[None]) if intrinsics.ndim == 1 else (first, second)
         self.usable: Tensor | None = None
         is_plain = _are_plain(model, *values) if self._same_on_cpu is None else self._same_on_cpu.usable is None
         if not (is_plain or known_true(usable := _usable(model, *values))):
@@ -82,8 +79,7 @@ class CameraRows:
             return of_intrinsics, None
         plan = present(self.native, "compiled code, which gave the sums,").plan
         if plan.places is not None:
-            whole = sums if plan.is_all else torch.zeros_like(self.k).index_add_(1, plan.places, sums)
-            return of_intrinsics, whole
+            return of_intrinsics, sums if plan.is_all else torch.zeros_like(self.k).index_add_(1, plan.places, sums)
         with torch.enable_grad():
             k = self.k.detach().requires_grad_()
             chart, lens = self.model.optics(columns(k))

@@ -43,9 +43,8 @@ def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics
         return pixels, valid & ((pixels - middle).norm(dim=-1) < reach)
 
     with torch.no_grad():
-        places = torch.linspace(
-            0, edges.count, _FIRST_PIECES * edges.count + 1, dtype=torch.float64, device=points.device
-        )
+        count, device = edges.count, points.device
+        places = torch.linspace(0, count, _FIRST_PIECES * count + 1, dtype=torch.float64, device=device)
         for _ in range(60):
             pixels, valid = seen(places)
             both = valid[1:] & valid[:-1]
@@ -58,7 +57,7 @@ def project_polyline(camera: CameraLike, points: Numbers, extrinsics: Extrinsics
                 across = (chord[:, 0] * offset[:, 1] - chord[:, 1] * offset[:, 0]).abs()
                 away = torch.maximum(away, torch.where(length > 0, across / length.clamp(min=1e-30), 0.0))
             divided = torch.where(both, (length > _LONGEST_STEP) | (away > _MOST_SAG), valid[1:] != valid[:-1])
-            divided &= step > _LEAST_PIECE * edges.count
+            divided &= step > _LEAST_PIECE * count
             if not bool(divided.any()):
                 break
             places = torch.cat((places, (start + step / 2)[divided])).sort().values

@@ -53,10 +53,7 @@ def classify(
     # fourth differences at a cell's corners and the next ones on either side, and a cell's sixteen nodes
     corners = F.pad(torch.cat((across, down), 1), (1, 1, 1, 1), value=-math.inf)
     most = torch.cat((corners, around, -around, known, -known), 1)
-    for dim in (2, 3):  # the largest of each four
-        most = torch.maximum(most.narrow(dim, 1, most.shape[dim] - 1), most.narrow(dim, 0, most.shape[dim] - 1))
-        most = torch.maximum(most.narrow(dim, 2, most.shape[dim] - 2), most.narrow(dim, 0, most.shape[dim] - 2))
-    across, down, high, low, some, every = most.split((2, 2, 2, 2, 1, 1), 1)
+    across, down, high, low, some, every = _largest(most, 4, 4).split((2, 2, 2, 2, 1, 1), 1)
     missed = (CELL_MISSED * half * (across + down)).square()
     reach = CELL_MARGIN + CELL_OVERSHOOT * (high + low)
     near = (high + reach > -1) & (low + reach > -1)

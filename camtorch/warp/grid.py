@@ -17,16 +17,7 @@ from camtorch.evaluate.door import is_cheap_to_read, is_eager, keeps_graph
 from camtorch.evaluate.tensors import are_plain, is_unknown
 from camtorch.native import sampler
 from camtorch.native.library import native_available
-from camtorch.native.structs import (
-    CELL_QUINTIC,
-    CELL_TODO,
-    FAR,
-    OUTSIDE,
-    POSITIONS,
-    RADIUS_TABLE,
-    STEP,
-    SURFACE,
-)
+from camtorch.native.structs import CELL_QUINTIC, CELL_TODO, FAR, OUTSIDE, POSITIONS, RADIUS_TABLE, STEP, SURFACE
 from camtorch.poses.rotations import turn
 from camtorch.projection.evaluation import native_forms
 from camtorch.projection.native_calls import NativeMove

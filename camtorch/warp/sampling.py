@@ -28,11 +28,7 @@ _TRACED_LEVELS = 4  # if the values that decide cannot be read: down to a sixtee
 
 
 def render(
-    images: Tensor,
-    where: Positions,
-    how: Sampler,
-    kept: dict[int, Pyramid] | None = None,
-    out: Tensor | None = None,
+    images: Tensor, where: Positions, how: Sampler, kept: dict[int, Pyramid] | None = None, out: Tensor | None = None
 ) -> Tensor:
     """Return the images (B, C, h, W') that a warp makes of (B or 1, C, H, W), in their dtype.
 
@@ -66,11 +62,7 @@ def prepared(images: Tensor, where: Positions, how: Sampler, out: Tensor | None 
 
 
 def by_torch(
-    images: Tensor,
-    where: Positions,
-    how: Sampler,
-    kept: dict[int, Pyramid] | None = None,
-    out: Tensor | None = None,
+    images: Tensor, where: Positions, how: Sampler, kept: dict[int, Pyramid] | None = None, out: Tensor | None = None
 ) -> Tensor:
     """Sample images (B or 1, C, H, W) by `grid_sample`; see `render`."""
     where = where.pixels

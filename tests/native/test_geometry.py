@@ -132,8 +132,8 @@ def test_unprojects_as_the_formula_does(key, dtype):
             exact = make(camera.key, camera.intrinsics.double(), camera.distortion.double())
             around = [formula_of(exact, UNPROJECT, _moved(q, 32 * eps, seed)) for seed in range(2)]
             there = formula_of(exact, UNPROJECT, q.double())[0]
-        found = geometry.unproject(native(camera), q[None], keeps=True)
-        rays, found_valid = found.rays[:, 0].mT, found.valid[0]
+        rays, found_valid, _ = geometry.unproject(native(camera), q[None], keeps=True)
+        rays, found_valid = rays[:, 0].mT, found_valid[0]
         sure = torch.stack([ok for _, ok in around]).eq(valid).all(0)
         assert found_valid[sure & valid].all()
         assert not found_valid[sure & ~valid].any()
@@ -181,8 +181,8 @@ def test_derivatives_are_those_of_the_formula(key, dtype):
             if direction is PROJECT:
                 by_value, sums = geometry.project_vjp(made, rows, cotangents, True, True)
             else:
-                solved = geometry.unproject(made, rows, keeps=True)
-                by_value, sums = geometry.unproject_vjp(made, solved.valid, solved.solution, cotangents, True, True)
+                _, *solved = geometry.unproject(made, rows, keeps=True)
+                by_value, sums = geometry.unproject_vjp(made, *solved, cotangents, True, True)
             found = [by_value[0], sums[0, :4]]
             found += [of_coefficients(camera, sums[0, 4:])] if camera.distortion.numel() else []
             for have, want in zip(found, expected, strict=True):
@@ -211,18 +211,18 @@ def test_a_row_is_what_it_is_alone(key):
 def test_any_strides_and_threads(key):
     made = native(one(key).float())
     q = pixels(one(key).float()).repeat(40, 1)
-    expected = geometry.unproject(made, q[None], keeps=True)
-    weight = torch.randn(expected.rays.shape, generator=torch.Generator().manual_seed(0))
-    cotangents = geometry.unproject_vjp(made, expected.valid, expected.solution, weight, True, True)
+    expected, *solved = geometry.unproject(made, q[None], keeps=True)
+    weight = torch.randn(expected.shape, generator=torch.Generator().manual_seed(0))
+    cotangents = geometry.unproject_vjp(made, *solved, weight, True, True)
     wide = torch.full((len(q), 7), math.nan)
     wide[:, 1:6:4] = q
     for rows in (q.mT.contiguous().mT, wide[:, 1:6:4], q.flip(-1).flip(-1)):
-        assert geometry.unproject(made, rows[None]).rays.equal(expected.rays)
+        assert geometry.unproject(made, rows[None])[0].equal(expected)
     with patch.object(geometry, "thread_count", lambda: 3):
-        again = geometry.unproject(made, q[None], keeps=True)
-        assert again.rays.equal(expected.rays)
+        again, *solved = geometry.unproject(made, q[None], keeps=True)
+        assert again.equal(expected)
         turned = weight.movedim(0, -1).contiguous().movedim(-1, 0)
-        found = geometry.unproject_vjp(made, again.valid, again.solution, turned, True, True)
+        found = geometry.unproject_vjp(made, *solved, turned, True, True)
     assert all(a.equal(b) for a, b in zip(found, cotangents, strict=True))
 
 
