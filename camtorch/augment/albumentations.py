@@ -20,7 +20,7 @@ from albumentations.core.type_definitions import Targets
 from camtorch.augment import numpy as arrays
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import Unknown, camera_of_sample
-from camtorch.augment.fields import KINDS
+from camtorch.augment.fields import KINDS, PLACE
 from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.matrices import NAMES
 from camtorch.augment.names import kind_of
@@ -80,7 +80,7 @@ class Transform(FrontEnd, A.DualTransform):
     @property
     def targets(self) -> dict[str, Callable[..., Any]]:
         nothing: Callable[..., Any] = self.apply  # `apply_with_params` moves all targets together
-        return dict.fromkeys((*KINDS, *_TARGETS, *NAMES, *self.augmentation.fields, "camera"), nothing)
+        return dict.fromkeys((*KINDS, *_TARGETS, *NAMES, *self.augmentation.fields, "camera", PLACE), nothing)
 
     def to_dict_private(self) -> dict[str, Any]:
         parts = {name: as_plain(getattr(self, name), f"{_OWNER}: {name}") for name in ("augmentation", "camera")}
@@ -119,7 +119,8 @@ class Transform(FrontEnd, A.DualTransform):
 
         def write(moved: Sample) -> Sample:
             change = present(self.augmentation.last, "the change of the call that moved")
-            result = data | {name: moved[name] for name in ("camera", "crop_place") if name in moved}
+            followed = ("camera", PLACE, "rotation") if PLACE in moved else ("camera",)  # the place follows from both
+            result = data | {name: moved[name] for name in followed if name in moved}
             for field, (name, target) in places.items():
                 seen = moved.get(f"{field}_valid")
                 result[name] = _taken(target, data[name], moved[field], seen, change.parts[0].image_size)

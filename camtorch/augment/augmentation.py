@@ -410,7 +410,7 @@ class Augmentation(SampleTransform):
                 self.tell_of_empty_images(camera)
         moved = self._moved(sample, batch, change)
         if self.place or PLACE in sample:
-            _put_place(sample, moved, self._name)
+            put_place(sample, moved, self._name)
         return moved, change
 
     @on_samples
@@ -488,7 +488,7 @@ def _are_alike(value: Any) -> bool:
     return same.size > 0 and bool(same.all()) if isinstance(same, np.ndarray) else known_true(same)
 
 
-def _put_place(sample: Mapping[str, Any], moved: dict[str, Any], owner: str) -> None:
+def put_place(sample: Mapping[str, Any], moved: dict[str, Any], owner: str) -> None:
     """Put `crop_place` into a moved sample, by its camera and by all that turned it; see `ct.views.crop_place`."""
     if PLACE in sample and not ("rotation" in sample and "camera" in moved):
         raise ValueError(

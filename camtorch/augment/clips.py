@@ -34,7 +34,7 @@ class Clips:
 
         fields: name -> kind, of other names. tables: names of the fields with tables of landmarks.
         """
-        given = {name: value for name, value in sample.items() if name not in (*OWN, PLACE) and value is not None}
+        given = {name: value for name, value in sample.items() if name not in OWN and value is not None}
         kinds = {name: kind_of(name, value, fields, owner) for name, value in given.items()}
         dims = {name: getattr(value, "ndim", 0) for name, value in given.items()}
         if (image := next((name for name, kind in kinds.items() if kind == "image" and dims[name] == 5), None)) is None:

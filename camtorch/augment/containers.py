@@ -21,8 +21,9 @@ from kornia.geometry.boxes import Boxes
 from torch import Tensor, nn
 
 from camtorch import augment
+from camtorch.augment.augmentation import put_place
 from camtorch.augment.change import Change
-from camtorch.augment.fields import OWN
+from camtorch.augment.fields import OWN, PLACE
 from camtorch.augment.front_end import FrontEnd
 from camtorch.augment.kornia_parts import BasicAugmentationBase
 from camtorch.augment.matrices import Guess, pinhole_of_matrix
@@ -36,7 +37,7 @@ class _Dict(NamedTuple):
 
     texts: Sample  # values that are strings: image_path is no image
     rest: Sample  # the others, which the container gets
-    fields: Sample  # of them, those that move and that kornia does not know; a `Single` if the image has no dim B
+    fields: Sample  # of them, those that change and that kornia does not know; a `Single` if the image has no dim B
     kinds: dict[str, str]  # of these fields, but for flags and orders of landmarks
     image: Tensor | None
     camera: Any
@@ -54,9 +55,15 @@ def _read_dict(container: Any, given: Sample, ours: list[FrontEnd]) -> _Dict:
     named = {name: kind for one in ours for name, kind in one.augmentation.fields.items()}
     filled = {name: rest[name] for name in unknown if rest[name] is not None}
     kinds = {n: kind for n, value in filled.items() if (kind := kind_of(n, value, named, owner, is_single))}
+    if rest.get(PLACE) is not None and "rotation" not in kinds:
+        raise ValueError(
+            f"{owner}: a sample with {PLACE} must have the rotation that came with it, as it follows from that and the "
+            f"camera; got {', '.join(given)}. Leave {PLACE} out, or keep the rotation"
+        )
     _check_others(container, [*kinds, *(["camera"] if rest.get("camera") is not None else [])])
     tables = {n for one in ours if one.augmentation.mirroring for n in one.augmentation.mirroring.by_name}
     fields = {n: rest[n] for n in unknown if n in kinds or n.removesuffix("_valid") in kinds or n in tables}
+    fields |= {PLACE: rest[PLACE]} if rest.get(PLACE) is not None else {}
     return _Dict(texts, rest, Single(fields) if is_single else fields, kinds, image, given.get("camera"))
 
 
@@ -98,7 +105,7 @@ def _params_for(container: Any, camera: Any, image: Tensor | None, params: Any) 
 
 
 @on_samples
-def _moved(part: Any, fields: Sample, params: Params, kinds: dict[str, str], back: bool) -> Sample:
+def _fields_moved(part: Any, fields: Sample, params: Params, kinds: dict[str, str], back: bool) -> Sample:
     """Move the fields of a dict that kornia does not know by one of ours, and return them with their flags."""
     device = next((value.device for value in fields.values() if isinstance(value, Tensor)), torch.device("cpu"))
     clips = int(params["video_batch_size"]) if "video_batch_size" in params else None
@@ -106,6 +113,8 @@ def _moved(part: Any, fields: Sample, params: Params, kinds: dict[str, str], bac
     with torch.autocast(device.type, enabled=False):
         change = part.change(params, device)
         moved = part.augmentation.moved_by(change.inverse() if back else change, flat, kinds, predicted=back)
+    if PLACE in fields:
+        put_place(flat, moved, type(part).__name__)
     kept = {n: v for n, v in moved.items() if n in fields or n.removesuffix("_valid") in kinds}
     return {n: v.unflatten(0, (clips, -1)) for n, v in kept.items()} if clips else type(fields)(kept)
 
@@ -123,13 +132,16 @@ def _with_fields(
     result, fields = call(self, read.rest, params=params), read.fields
     applied = [pair for pair in parts_of(self._params if params is None else params, self) if pair[0] in ours]
     for part, drawn in reversed(applied) if back else applied:
-        fields = _moved(part, fields, drawn, read.kinds, back) if read.kinds else fields
+        fields = _fields_moved(part, fields, drawn, read.kinds, back) if read.kinds else fields
         if read.camera is not None:
             change: Change = part.change(drawn)
             cameras = change.source if back else change.target
             cameras = (cameras[0] if isinstance(read.fields, Single) else cameras).clone()
             result["camera"] = list(cameras) if isinstance(read.camera, list) else cameras
-    return {**result, **fields, **read.texts}
+    result = {**result, **fields, **read.texts}
+    if back:
+        result.pop(PLACE, None)  # what comes back is no crop
+    return result
 
 
 def _lost_stay_lost(call: Callable[..., Boxes], self: Any, boxes: Any, key: DataKey) -> Boxes:

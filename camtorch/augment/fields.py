@@ -396,7 +396,7 @@ KINDS = {
 BOXES = "boxes", *_PLACED
 PLACE = "crop_place"
 """The place of a sample's crop, which follows its camera and rotation through all augmentations."""
-OWN = ("camera", "source_camera", "source_rotation", "scale")  # these come with a change and do not move
+OWN = ("camera", "source_camera", "source_rotation", "scale", PLACE)  # these follow from the change: no kind moves them
 
 
 def field_of(kind: str, value: Tensor) -> Field:

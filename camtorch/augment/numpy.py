@@ -155,7 +155,7 @@ class Transform(FrontEnd):
         """Return the way of each field, which its form alone decides: of images, of one, of numbers, or of all else."""
         ways, mirroring = dict[str, Way](), self.augmentation.mirroring
         for name, value in sample.items():
-            kind = None if name in (*OWN, PLACE) or value is None else self._kind(name, value, sample)
+            kind = None if name in OWN or value is None else self._kind(name, value, sample)
             if kind in IMAGES and (name in ALIASES or isinstance(value, (list, tuple))):
                 ways[name] = _way_of_images(name, value, size, kind)
             elif kind in IMAGES:

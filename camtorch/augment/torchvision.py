@@ -65,7 +65,8 @@ class Transform(FrontEnd, v2.Transform):
     image if the sample has no other image and its name means nothing else. `valid=True` adds a flag for each point or
     box of a dict: `target["keypoints_valid"]`, a bool tensor, for `target["keypoints"]`: on the new image, and valid
     before. Flags that a sample already has are always updated. Count, order, formats and dtypes stay; canvas_size is
-    the new camera's. Gradients reach the inputs, not the cameras.
+    the new camera's. Gradients reach the inputs, not the cameras. A dict gets the `crop_place` of `BoxCrop(place=True)`
+    with the `rotation` and the `camera` from which it follows.
 
     Flips, crops and sizes of torchvision, before or after this transform, move keypoints and boxes, and leave `gaze`,
     `head_pose` and `camera`. In their place take camtorch's own, in one transform:
@@ -106,15 +107,16 @@ class Transform(FrontEnd, v2.Transform):
         flat, spec = pytree.tree_flatten_with_path(given)
         paths, leaves = [path for path, _ in flat], [leaf for _, leaf in flat]
         names = [_name(path) for path in paths]
-        keys = names if len(set(names)) == len(names) else [f"{_place(path)}/{_name(path)}" for path in paths]
+        keys = _keys(paths, names)
         fields = {i: _read_leaf(names[i], leaves[i], kind) for i, kind in self._kinds(flat, names).items()}
         sizes = []
         for i, (kind, value, _) in fields.items():
             size = getattr(leaves[i], "canvas_size", None) or (value.shape[-2:] if kind in IMAGES else ())
             sizes += [(type(leaves[i]).__name__, tuple(size))] if size else []
         cameras = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Camera)]
-        if len(cameras) > 1:
-            raise ValueError(f"{_OWNER}: a sample must have one camera; got {len(cameras)}")
+        for name, count in (("camera", len(cameras)), (PLACE, names.count(PLACE))):
+            if count > 1:
+                raise ValueError(f"{_OWNER}: a sample must have one {name}; got {count}")
         augmentation, given_camera = self.augmentation, leaves[cameras[0]] if cameras else self.camera
         matrix = next(((keys[i], value) for i, (kind, value, _) in fields.items() if kind == "K"), None)
         camera = camera_of_sample(_OWNER, given_camera, augmentation.camera, augmentation.needs_camera, sizes, matrix)
@@ -122,6 +124,8 @@ class Transform(FrontEnd, v2.Transform):
         kinds = {keys[i]: field.kind or KEEP for i, field in fields.items()}
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
         sample = Frames({keys[i]: field.value for i, field in fields.items()}, camera=detached(camera))
+        added = [name for name in (PLACE, "rotation") if augmentation.place and name not in sample]
+        added += ["camera"] if is_guessed or (augmentation.place and not cameras) else []
 
         def write(moved: Sample, change: Change) -> Any:
             for i, field in fields.items():  # where nothing moves, PIL images and tv_tensors stay as they are
@@ -130,10 +134,8 @@ class Transform(FrontEnd, v2.Transform):
             for i in cameras:
                 leaves[i] = moved["camera"]
             result = pytree.tree_unflatten(leaves, spec)
-            if augmentation.place and isinstance(result, dict):
-                result[PLACE] = moved[PLACE]
-            if is_guessed and isinstance(result, dict):
-                result["camera"] = moved["camera"]
+            if isinstance(result, dict):
+                result |= {name: moved[name] for name in added}
             for i in fields if self.valid else ():
                 path, valid = paths[i], moved.get(f"{keys[i]}_valid")
                 if valid is not None and path and isinstance(path[-1], pytree.MappingKey):
@@ -150,6 +152,7 @@ class Transform(FrontEnd, v2.Transform):
         single = all(getattr(leaf, "ndim", 0) < 4 for _, leaf in flat)  # images of batches have as many dims
         for i, ((path, leaf), name) in enumerate(zip(flat, names, strict=True)):
             if leaf is None or isinstance(leaf, Camera) or name in OWN:
+                kinds |= {i: None} if name == PLACE else {}
                 continue
             # a list of plain numbers is one value
             whole_path = (d for d, step in enumerate(reversed(path)) if not isinstance(step, pytree.SequenceKey))
@@ -179,9 +182,13 @@ def _name(path: Any) -> str:
     return next((word for word in reversed(words) if isinstance(word, str)), pytree.keystr(path) or "[0]")
 
 
-def _place(path: Any) -> str:
-    """Return where a leaf is, in front of its name: names may be there twice."""
-    return pytree.keystr(path[:-1] if path and isinstance(path[-1], pytree.MappingKey) else path)
+def _keys(paths: list[Any], names: list[str]) -> list[str]:
+    """Return the names of leaves, with where they are in front if some are there twice."""
+    if len(set(names)) == len(names):
+        return names
+    whole = [name for name in (PLACE, "rotation") if names.count(name) == 1]  # of the whole sample
+    places = [pytree.keystr(path[:-1] if path and isinstance(path[-1], pytree.MappingKey) else path) for path in paths]
+    return [name if name in whole else f"{place}/{name}" for place, name in zip(places, names, strict=True)]
 
 
 class _Leaf(NamedTuple):

@@ -3,14 +3,18 @@
 import math
 from functools import partial
 
+import albumentations
 import numpy as np
 import pytest
 import torch
 from cameras import every_model, fisheye, one
+from kornia.augmentation import AugmentationSequential, VideoSequential
 
 import camtorch as ct
+import camtorch.augment.albumentations
 import camtorch.augment.kornia
 import camtorch.augment.numpy
+from camtorch.warp.views import place_of
 
 SIZE = (160, 120)
 wide = partial(fisheye, (480, 640), 0.3125)
@@ -175,6 +179,63 @@ def test_the_place_of_the_crop_is_a_field():
     arrays = A.numpy.Transform(chain)({name: value[0].numpy() for name, value in sample.items()})
     np.testing.assert_allclose(arrays["crop_place"], alone["crop_place"].numpy())
     assert A.collate([alone, alone])["crop_place"].shape == (2, 5)
+
+
+def sample_with_a_place():
+    boxes = torch.tensor([[240.0, 180.0, 300.0, 250.0]])
+    crop = ct.augment.BoxCrop(SIZE, place=True)
+    return crop, {"image": torch.rand(3, 480, 640), "boxes": boxes, "camera": wide().requires_grad_(False)}
+
+
+def test_the_place_goes_on_in_torchvision(vision):
+    (crop, sample), flip = sample_with_a_place(), ct.augment.HorizontalFlip(p=1)
+    Transform = vision[0].Transform  # noqa: N806
+    apply, front = (lambda one, given: Transform(one)(given)), Transform(crop, sample["camera"])
+    cropped = crop(sample)
+    want = flip(cropped)["crop_place"]
+    without = {name: value for name, value in sample.items() if name != "camera"}
+    for out in (front(sample), front(without)):
+        assert {"crop_place", "rotation", "camera"} <= out.keys()
+        torch.testing.assert_close(apply(flip, out)["crop_place"], want)
+    hand = {"keypoints": torch.tensor([[260.0, 200.0]])}
+    out = apply(flip, front({**sample, "left": hand, "right": hand}))  # names are there twice
+    torch.testing.assert_close(out["crop_place"], want)
+    arrays = cropped | {name: cropped[name].numpy() for name in ("crop_place", "rotation")}
+    np.testing.assert_allclose(apply(flip, {"a": arrays})["a"]["crop_place"], want, atol=1e-6)
+    with pytest.raises(ValueError, match="crop_place must have the rotation"):
+        apply(flip, {name: value for name, value in cropped.items() if name != "rotation"})
+    with pytest.raises(ValueError, match="must have one crop_place; got 2"):
+        apply(flip, {**cropped, "other": {"crop_place": want}})
+
+
+def test_the_place_goes_on_in_kornia():
+    crop, sample = sample_with_a_place()
+    cropped = crop({name: value if name == "camera" else value[None] for name, value in sample.items()})
+    del cropped["boxes_valid"]
+    kornia = ct.augment.kornia
+    parts = [kornia.HorizontalFlip(cropped["camera"][0], p=1), kornia.RandomMount(cropped["camera"][0], roll=(20, 20))]
+    for part in parts:
+        container = AugmentationSequential(part, data_keys=None)
+        out = container(cropped)
+        place = place_of(out["camera"], out["rotation"])
+        torch.testing.assert_close(out["crop_place"], place)
+        assert not torch.equal(out["crop_place"], cropped["crop_place"])
+        assert "crop_place" not in container.inverse(out)
+        clips = {name: cropped[name].expand(2, *cropped[name].shape) for name in ("crop_place", "rotation")}
+        clips["image"] = cropped["image"].expand(2, -1, -1, -1, -1)
+        videos = AugmentationSequential(VideoSequential(part), data_keys=None)(clips)["crop_place"]
+        assert videos.shape == (2, 1, 5)
+        assert part is parts[1] or torch.equal(videos[1], out["crop_place"])
+        with pytest.raises(ValueError, match="crop_place must have the rotation"):
+            container({name: value for name, value in cropped.items() if name != "rotation"})
+
+
+def test_the_place_goes_on_in_pipelines_of_albumentations():
+    (crop, sample), flip = sample_with_a_place(), ct.augment.HorizontalFlip(p=1)
+    transform, arrays = ct.augment.albumentations.Transform, {"boxes": sample["boxes"].numpy()}
+    arrays["image"] = sample["image"].permute(1, 2, 0).numpy()
+    pipeline = albumentations.Compose([transform(crop, sample["camera"]), transform(flip)])
+    np.testing.assert_allclose(pipeline(**arrays)["crop_place"], flip(crop(sample))["crop_place"], atol=1e-6)
 
 
 def test_gradients_reach_the_boxes_of_samples():
