@@ -29,12 +29,11 @@ FRONT_ENDS = (
 )
 """The hint of errors about what other libraries pass."""
 KEEP = "keep"
-IMAGES = ("image", "mask", "depth", "distance")
 
 Move = Callable[[Change, Tensor, Mapping[str, float]], Any]
 
 
-def _no_hint(name: str, value: Tensor, batched: bool) -> str:
+def _no_hint(value: Tensor, name: str, batched: bool) -> str:
     return ""
 
 
@@ -54,9 +53,10 @@ class Field:
     by_c: Label | Literal["never"] | Callable[[Options, float], Sampler] | None = None
     """How the call of C for whole samples moves it, as `move` would: (options, mask_fill) -> sampler for images. None:
     that call leaves it to `move`; "never": it needs each pixel's position, and the call is made for no such sample."""
+    is_image: bool = False  # whether its last dims are those of the camera's image, and whole numbers stay whole
     tells_batches: bool = False  # whether its number of dims distinguishes a batch from a sample
     in_pixels: bool = False  # whether it is warned of numbers that hardly are pixels of the image
-    hint: Callable[[str, Tensor, bool], str] = _no_hint  # (name, value, batched) -> what to do about a wrong shape
+    hint: Callable[[Tensor, str, bool], str] = _no_hint  # (value, name, batched) -> what to do about a wrong shape
     check: Callable[[Tensor, str, str], None] = _no_check  # (value, name, owner); raises if values are of no such kind
 
     def __post_init__(self) -> None:
@@ -151,13 +151,13 @@ def _sided_boxes(kind: str, form: str) -> Field:
     )
 
 
-def _image_hint(name: str, value: Tensor, batched: bool) -> str:
+def _image_hint(value: Tensor, name: str, batched: bool) -> str:
     if value.ndim == 5:
         return f"The frames of clips go in as a batch, by {name}.flatten(0, 1)"
     return f"A grey image goes in as {name}[None]" if value.ndim == 2 else ""
 
 
-def _rows_hint(name: str, value: Tensor, batched: bool) -> str:
+def _rows_hint(value: Tensor, name: str, batched: bool) -> str:
     """Return the hint for pixels or boxes without the dim of their number."""
     if value.ndim - batched != 1:
         return ""
@@ -165,31 +165,31 @@ def _rows_hint(name: str, value: Tensor, batched: bool) -> str:
     return f"A single one for each sample goes in as {name}[..., None, :]{shared}"
 
 
-def _keypoints_hint(name: str, value: Tensor, batched: bool) -> str:
+def _keypoints_hint(value: Tensor, name: str, batched: bool) -> str:
     if value.ndim and value.shape[-1] == 3:
         return f"Pass visibility, [..., 2], as {name}_valid=..., a flag for each"
-    return _rows_hint(name, value, batched) if value.shape[-1:] == (2,) else ""
+    return _rows_hint(value, name, batched) if value.shape[-1:] == (2,) else ""
 
 
-def _boxes_hint(name: str, value: Tensor, batched: bool) -> str:
-    return _rows_hint(name, value, batched) if value.shape[-1:] == (4,) else ""
+def _boxes_hint(value: Tensor, name: str, batched: bool) -> str:
+    return _rows_hint(value, name, batched) if value.shape[-1:] == (4,) else ""
 
 
-def _column_hint(name: str, value: Tensor, batched: bool) -> str:
+def _column_hint(value: Tensor, name: str, batched: bool) -> str:
     return f"OpenCV's column goes in as {name}[..., 0]" if value.shape[-2:] == (3, 1) else ""
 
 
-def _landmarks_hint(name: str, value: Tensor, batched: bool) -> str:
-    return _column_hint(name, value, batched) or (_rows_hint(name, value, batched) if value.shape[-1] in (2, 3) else "")
+def _landmarks_hint(value: Tensor, name: str, batched: bool) -> str:
+    return _column_hint(value, name, batched) or (_rows_hint(value, name, batched) if value.shape[-1] in (2, 3) else "")
 
 
-def _rays_hint(name: str, value: Tensor, batched: bool) -> str:
+def _rays_hint(value: Tensor, name: str, batched: bool) -> str:
     if value.ndim and value.shape[-1] == 2:
         return f"Pitch and yaw in radians go in as pitch_yaw, or with fields={{{name!r}: 'pitch_yaw'}}"
-    return _column_hint(name, value, batched)
+    return _column_hint(value, name, batched)
 
 
-def _pose_hint(name: str, value: Tensor, batched: bool) -> str:
+def _pose_hint(value: Tensor, name: str, batched: bool) -> str:
     if value.shape[-1:] != (3,):
         return ""
     return (
@@ -286,11 +286,29 @@ _POSE = Field(
 )
 KINDS = {
     "image": Field(
-        dims=3, shape="(B, C, H, W)", move=_by(Change.images), by_c=_image_sampler, tells_batches=True, hint=_image_hint
+        dims=3,
+        shape="(B, C, H, W)",
+        move=_by(Change.images),
+        by_c=_image_sampler,
+        is_image=True,
+        tells_batches=True,
+        hint=_image_hint,
     ),
-    "mask": Field(dims=2, most_dims=3, shape="(B, C, H, W) or (B, H, W)", move=_planes(_labels), by_c=_mask_sampler),
+    "mask": Field(
+        dims=2,
+        most_dims=3,
+        shape="(B, C, H, W) or (B, H, W)",
+        move=_planes(_labels),
+        by_c=_mask_sampler,
+        is_image=True,
+    ),
     "depth": Field(
-        dims=2, most_dims=3, shape="(B, 1, H, W) or (B, H, W), along z", move=_planes(_by(Change.depth)), by_c="never"
+        dims=2,
+        most_dims=3,
+        shape="(B, 1, H, W) or (B, H, W), along z",
+        move=_planes(_by(Change.depth)),
+        by_c="never",
+        is_image=True,
     ),
     "distance": Field(
         dims=2,
@@ -298,6 +316,7 @@ KINDS = {
         shape="(B, 1, H, W) or (B, H, W), along the ray",
         move=_planes(_by(Change.distance)),
         by_c="never",
+        is_image=True,
     ),
     "keypoints": Field(
         dims=2,
@@ -336,7 +355,7 @@ KINDS = {
         most_dims=3,
         ends=[(2,), (3,)],
         shape="(B, N, 2) pixels or (B, N, 3) points of the camera frame",
-        move=_by(Change.points),
+        move=_by(Change.points),  # never called: `field_of` gives the row of keypoints or of points
         tells_batches=True,
         in_pixels=True,
         hint=_landmarks_hint,
@@ -394,13 +413,14 @@ KINDS = {
     ),
 }
 BOXES = "boxes", *_PLACED
+IMAGES = tuple(kind for kind, field in KINDS.items() if field.is_image)
 PLACE = "crop_place"
 """The place of a sample's crop, which follows its camera and rotation through all augmentations."""
 OWN = ("camera", "source_camera", "source_rotation", "scale", PLACE)  # these follow from the change: no kind moves them
 
 
 def field_of(kind: str, value: Tensor) -> Field:
-    """Return the field of values of a kind: `landmarks` are keypoints or points, by their last dim."""
+    """Return the field by which values of a kind move: `landmarks` as keypoints or points, by their last dim."""
     if kind != "landmarks":
         return KINDS[kind]
     return KINDS["points" if value.shape[-1] == 3 else "keypoints"]

@@ -12,8 +12,9 @@ from camtorch.augment.sample import KeepsCamera, SampleTransform
 class FrontEnd(KeepsCamera):
     """The base of front ends, which pass the samples of a library to an augmentation.
 
-    Its method `_read` returns a sample as the augmentation takes it, and a function that writes the moved one in the
-    form of the given one. kornia's calls a method for each kind of value instead.
+    Its method `_read` returns a sample as the augmentation takes it, that of torchvision also the kinds of its fields,
+    and a function that writes the moved one in the form of the given one. kornia's calls a method for each kind of
+    value instead.
     """
 
     augmentation: Any

@@ -148,7 +148,8 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
         params = self._params if params is None else params
         ours = *self.augmentation.ranges, *self.augmentation.crops
         if missing := [name for name in ("batch_prob", *ours) if name not in params]:
-            raise ValueError(f"{type(self).__name__}: params must have {', '.join(missing)}; got none. Call it first")
+            need, has = ", ".join(missing), ", ".join(params) or "none"
+            raise ValueError(f"{type(self).__name__}: params must have {need}; got {has}. Call it first")
         values = {"apply": self._gate(params), **{name: params[name] for name in ours}}
         if self.augmentation.crops and any(known_some(values[name].isnan()) for name in self.augmentation.crops):
             raise ValueError(

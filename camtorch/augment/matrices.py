@@ -64,7 +64,7 @@ def _guessed(degrees: float, size: tuple[int, int]) -> Pinhole:
         return Pinhole.from_fov(degrees, image_size=size).requires_grad_(False)
 
 
-def matrix_hint(name: str, value: Tensor, batched: bool) -> str:
+def matrix_hint(value: Tensor, name: str, batched: bool) -> str:
     """Return what to do about a wrong shape of a matrix K."""
     if value.shape[-2:] in SIDES and batched and value.ndim == 2:
         return f"One that all samples share goes in as {name}.expand(B, -1, -1)"
@@ -108,7 +108,7 @@ def pinhole_of_matrix(name: str, matrix: Tensor | list[Tensor], size: tuple[int,
     for row in rows:
         if row.shape[-2:] not in SIDES or row.ndim > 3 - isinstance(matrix, list):
             raise ValueError(
-                f"{owner}: {name} must be {SHAPE}; got shape {tuple(row.shape)}. {matrix_hint(name, row, False)}"
+                f"{owner}: {name} must be {SHAPE}; got shape {tuple(row.shape)}. {matrix_hint(row, name, False)}"
             )
         check_matrix(row, name, owner)
     numbers = torch.stack([numbers_of(row) for row in rows]) if isinstance(matrix, list) else numbers_of(matrix)

@@ -14,8 +14,10 @@ from camtorch.augment.fields import BOXES, KEEP, KINDS
 from camtorch.augment.matrices import NAMES
 from camtorch.evaluate.door import pytree
 
-ALIASES = {"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"}
-ALIASES |= {name: "K" for name in NAMES if name != "K"}
+ALIASES = {
+    **{"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"},
+    **{name: "K" for name in NAMES if name != "K"},
+}
 _PLACES = {
     "roi": "boxes",
     **dict.fromkeys(("eye", "pupil", "nose", "mouth", "corner", "center", "centre"), "keypoints"),

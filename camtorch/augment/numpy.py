@@ -147,7 +147,7 @@ class Transform(FrontEnd):
         kind = kind_of(name, value, self.augmentation.fields, _OWNER, single=True)
         if kind is None and name.endswith(_VALID):
             name = name.removesuffix(_VALID)
-            kind = kind_of(name, sample.get(name), self.augmentation.fields, _OWNER)
+            kind = kind_of(name, sample.get(name), self.augmentation.fields, _OWNER, single=True)
             kind = kind if kind not in IMAGES or np.ndim(value) > 1 else None  # a flag for each sample
         return kind
 

@@ -152,7 +152,7 @@ def check_shape(kind: str, name: str, value: Tensor, batched: bool, owner: str) 
     fits = not field.ends or any(shape[-len(end) :] == end for end in field.ends)
     if not fits or not field.dims <= len(shape) - batched <= field.most_dims:
         what = field.shape if batched else field.shape.replace("(B, ", "(")
-        hint = f". {hint}" if (hint := field.hint(name, value, batched)) else _hint(name)
+        hint = f". {hint}" if (hint := field.hint(value, name, batched)) else _hint(name)
         raise ValueError(f"{owner}: {name} must be {what}; got shape {shape}{hint}")
 
 

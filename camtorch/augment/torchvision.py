@@ -40,8 +40,12 @@ except Exception as error:  # a binary that does not match fails with a RuntimeE
     ) from error
 
 _OWNER = "torchvision.Transform"
-_BY_TYPE = {PIL.Image.Image: "image", tv_tensors.Image: "image", tv_tensors.Video: "image", tv_tensors.Mask: "mask"}
-_BY_TYPE |= {tv_tensors.BoundingBoxes: "boxes", tv_tensors.KeyPoints: "keypoints"}
+_BY_TYPE = {
+    **dict.fromkeys((PIL.Image.Image, tv_tensors.Image, tv_tensors.Video), "image"),
+    tv_tensors.Mask: "mask",
+    tv_tensors.BoundingBoxes: "boxes",
+    tv_tensors.KeyPoints: "keypoints",
+}
 _HELD = Tensor, np.ndarray
 
 
@@ -154,22 +158,18 @@ class Transform(FrontEnd, v2.Transform):
             if leaf is None or isinstance(leaf, Camera) or name in OWN:
                 kinds |= {i: None} if name == PLACE else {}
                 continue
-            # a list of plain numbers is one value
-            whole_path = (d for d, step in enumerate(reversed(path)) if not isinstance(step, pytree.SequenceKey))
-            lists = 0 if getattr(leaf, "ndim", 0) else next(whole_path, len(path) - 1)
-            value = functools.reduce(lambda held, _: [held], range(lists), leaf)
             kinds[i] = next((kind for of, kind in _BY_TYPE.items() if isinstance(leaf, of)), None)
             try:
                 if isinstance(leaf, PIL.Image.Image) and kind_of(name, [leaf], fields, _OWNER) == "mask":
                     kinds[i] = "mask"
-                kinds[i] = kinds[i] or kind_of(name, value, fields, _OWNER, single)
+                kinds[i] = kinds[i] or kind_of(name, _in_lists(leaf, path), fields, _OWNER, single)
             except ValueError as error:
                 problems[i] = error
-        if IMAGES[0] not in kinds.values():
+        if "image" not in kinds.values():
             named = {name for name in names if name in fields or name.endswith("_valid") or pattern_of(name, fields)}
             free = (i for i, kind in kinds.items() if not (kind or names[i] in named))
             first = next((i for i in free if isinstance(flat[i][1], Tensor) and flat[i][1].ndim > 1), -1)
-            kinds |= {} if first < 0 else {first: IMAGES[0]}
+            kinds |= {} if first < 0 else {first: "image"}
             problems.pop(first, None)
         for problem in problems.values():
             raise problem
@@ -180,6 +180,17 @@ def _name(path: Any) -> str:
     """Return the last key of a path that is a word, or the whole path."""
     words = [getattr(step, "key", getattr(step, "name", None)) for step in path]
     return next((word for word in reversed(words) if isinstance(word, str)), pytree.keystr(path) or "[0]")
+
+
+def _in_lists(leaf: Any, path: Any) -> Any:
+    """Return a leaf without dims in the lists that hold it: a list of plain numbers is one value."""
+    if getattr(leaf, "ndim", 0):
+        return leaf
+    for step in reversed(path[1:]):
+        if not isinstance(step, pytree.SequenceKey):
+            break
+        leaf = [leaf]
+    return leaf
 
 
 def _keys(paths: list[Any], names: list[str]) -> list[str]:
