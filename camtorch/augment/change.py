@@ -219,7 +219,7 @@ class Change:
         count: how many samples.
         parts: every sample is in one of them.
         mixed: return a `Mixed`, as the cameras came, even if all cameras are of one model.
-        gate: (count,) bool, where values may not be looked at: which rows of the only part move.
+        gate: (count,) bool, where values may not be looked at: which of the samples in parts that move do so.
     """
 
     __slots__ = ("_inverse", "_order", "count", "gate", "mixed", "parts")
@@ -367,14 +367,19 @@ class Change:
 
     def with_options(self, options: Options) -> Change:
         """Return the change with its warps made anew by other options."""
-        parts = [part.with_options(options) for part in self.parts]
-        return Change(self.count, parts, mixed=self.mixed, gate=self.gate)
+        return self._with_parts([part.with_options(options) for part in self.parts])
+
+    def _with_parts(self, parts: Sequence[Part], samples: list[int] | None = None) -> Change:
+        """Return a change like this one by other parts, of all its samples or of those named, which may repeat."""
+        count = self.count if samples is None else len(samples)
+        gate = self.gate if samples is None or self.gate is None else self.gate[samples]
+        return Change(count, parts, mixed=self.mixed, gate=gate)
 
     def row(self, i: int) -> Change:
         """Return the change of one sample."""
         for part in self.parts:
             if part.rows is None or i in part.rows:
-                return Change(1, [part.take([i if part.rows is None else part.rows.index(i)])])
+                return self._with_parts([part.take([i if part.rows is None else part.rows.index(i)])], [i])
         raise IndexError(f"Change: row must be one of {self.count} samples; got {i}")
 
     def inverse(self) -> Change:
@@ -385,7 +390,7 @@ class Change:
             part if part.moves is None else Part(part.target, part.warp.inverse(), rows=part.rows)
             for part in self.parts
         ]
-        self._inverse = Change(self.count, parts, mixed=self.mixed, gate=self.gate)
+        self._inverse = self._with_parts(parts)
         return self._inverse
 
     def each(

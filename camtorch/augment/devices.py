@@ -60,7 +60,7 @@ class Elsewhere(Change):
     def __init__(self, host: Change, device: torch.device):
         with outside_inference():
             parts = _remade(host.parts, lambda numbers: sent(numbers, device))
-        super().__init__(host.count, parts, mixed=host.mixed)
+        super().__init__(host.count, parts, mixed=host.mixed, gate=host.gate)
         self.host, self._device = host, device
         self._wide: Change | None = None
 
@@ -74,7 +74,7 @@ class Elsewhere(Change):
         # labels are computed in the wider dtype, and so are the cameras' tables
         if self._wide is None:
             wide = _remade(self.host.parts, lambda numbers: [t.to(dtype) for t in numbers])
-            self._wide = Elsewhere(Change(self.host.count, wide, mixed=self.host.mixed), self._device)
+            self._wide = Elsewhere(self.host._with_parts(wide), self._device)
         return self._wide.each(value, move, stay)
 
     def camera_for_sample(self, batched: bool) -> Camera:

@@ -207,7 +207,7 @@ class Batch(NamedTuple):
 def move(change: Change, kind: str, value: Tensor, options: Mapping[str, float]) -> MovedField:
     """Return values (B, ...) of a kind moved by a change; those of one sample may have more dims, of frames."""
     if lead := value.shape[1 : value.ndim - KINDS[kind].most_dims]:
-        frames = Change(math.prod(lead), [replace(part, rows=None) for part in change.parts])
+        frames = change._with_parts([replace(part, rows=None) for part in change.parts], [0] * math.prod(lead))
         result, valid = move(frames, kind, value.flatten(0, len(lead)), options)
         return result.reshape(1, *lead, *result.shape[1:]), valid if valid is None else valid.reshape(
             1, *lead, *valid.shape[1:]

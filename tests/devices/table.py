@@ -99,6 +99,13 @@ def shifted_by_a_draw(camera, pixels):
     return augment.RandomMount(shift=(0.1, 0.1, 0.1)).change(camera.detach(), draw).points(pixels[:1])
 
 
+def drawn_there(images, pixels, camera, gate):
+    """Return images and lists of pixels moved by a draw on their own device, where it may not be read."""
+    turns = dict.fromkeys(("yaw", "pitch", "roll"), 4 + gate)
+    draw = {**turns, "zoom": torch.ones_like(gate), "apply": gate > 0.5}
+    return augment.RandomMount(p=0.5)(image=images, keypoints=list(pixels), camera=camera, draw=draw)
+
+
 def counted(make, fields=1, model=ct.Pinhole):
     """Return a case of 8 large images, called a second time."""
 
@@ -167,6 +174,7 @@ CASES |= {
         lambda i, *each: augment.RandomMount()(augment.HorizontalFlip(p=1)(image=i, camera=ct.Mixed(each))),
         *(IMAGES, FISHEYE, BROWN),
     ),
+    "augment.RandomMount by a draw there": tried(drawn_there, IMAGES, PIXELS, FISHEYE, torch.tensor([1.0, 0.0])),
     "augment.RandomCamera": augmented(augment.RandomCamera, 5, like="dms60", image_size=(20, 30)),
     "augment.BoxCrop": augmented(augment.BoxCrop, image_size=(16, 16), yaw=3),
     "augment.HorizontalFlip": augmented(augment.HorizontalFlip, 13),
