@@ -250,6 +250,11 @@ class Change:
         """Return the cameras of a part after the change, where the gate is open, and those before it elsewhere."""
         new, gate = part.target, present(self.gate, "a gate")
         gate = gate if part.rows is None else gate[part.rows]
+        if type(new) is not type(part.camera):
+            raise ValueError(
+                "Change: with p < 1 the camera model must stay where draws may not be read, as in compiled code; got "
+                f"{type(new).__name__} for {type(part.camera).__name__}"
+            )
         gate = gate.to(new.intrinsics.device).unsqueeze(-1)
         intrinsics = torch.where(gate, new.intrinsics, part.camera.intrinsics)
         return remade(new, intrinsics=intrinsics, distortion=torch.where(gate, new.distortion, part.camera.distortion))
