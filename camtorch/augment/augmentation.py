@@ -25,7 +25,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.door import has_tangent, is_cheap_to_read, keeps_graph
 from camtorch.evaluate.tensors import are_concrete, are_numbers, known_false, known_true
-from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_part, as_whole, hinting, warn
+from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_part, as_whole, hinting, shown, warn
 from camtorch.values.module import typed_as
 from camtorch.warp.views import place_of
 from camtorch.warp.warp import Warp
@@ -258,6 +258,10 @@ class Augmentation(SampleTransform):
             has = ", ".join(map(str, draw)) or "nothing"
             raise ValueError(f"{self._name}: draw must have {', '.join(missing)}; got {has}")
         values: dict[str, Any] = {name: torch.as_tensor(draw[name]) for name in ("apply", *sizes)}
+        if values["apply"].ndim != 1:
+            raise ValueError(
+                f"{self._name}: draw['apply'] must be (B,), which of B samples move; got {shown(draw['apply'])}"
+            )
         values["apply"] = values["apply"] > 0.5
         if are_numbers(*values.values()):
             values = {n: (value if n == "apply" else value.double()).numpy() for n, value in values.items()}

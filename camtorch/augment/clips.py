@@ -13,6 +13,7 @@ from camtorch.augment.matrices import check_alike
 from camtorch.augment.names import kind_of
 from camtorch.augment.reading import moving
 from camtorch.cameras.camera import Camera
+from camtorch.values.arguments import as_mapping
 
 
 @dataclass(frozen=True)
@@ -74,16 +75,19 @@ class Clips:
 
     def for_frames(self, draw: Mapping[str, Any]) -> dict[str, Any]:
         """Return a draw for the clips as one for their frames."""
+        draw = as_mapping(draw, "draw", self.owner, "what draw() returns")
         return {name: self.repeated(value, f"draw[{name!r}]") for name, value in draw.items()}
 
     def repeated(self, value: Any, name: str) -> Any:
         """Return a value (B, ...) of each clip, repeated for each of its frames; a single camera serves all."""
-        if not hasattr(value, "__len__") or (isinstance(value, Camera) and not value.batch_shape):
+        try:
+            count = len(value)
+        except TypeError:  # a single camera, or a number
             return value
         clips, frames = self.shape
         several = isinstance(value, Camera) and len(value.batch_shape) > 1
-        if len(value) != clips or several:
-            got, hint = tuple(value.batch_shape) if several else len(value), ""
+        if count != clips or several:
+            got, hint = tuple(value.batch_shape) if several else count, ""
             if name == "camera":
                 flat = "ct.cat(list(camera))" if several else "camera, one for each"
                 hint = (

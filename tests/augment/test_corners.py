@@ -78,8 +78,58 @@ def test_a_gate_of_numbers_is_a_gate(camera):
         assert not torch.equal(out[0], points[0])
     with pytest.raises(ValueError, match=r"draw\['yaw'\] must be finite"):
         mount(keypoints=points, draw={**draw, "yaw": torch.tensor([math.nan, 0.0])})
+    expected = r"RandomMount: draw\['apply'\] must be \(B,\), which of B samples move; got "
+    for image in (torch.rand(2, 1, *SIZE), torch.rand(2, 3, 1, *SIZE)):  # frames, and clips of them
+        for gate, got in ((True, "True"), (torch.tensor(True), "tensor"), (torch.ones(2, 1), "Tensor of shape")):
+            with pytest.raises(ValueError, match=expected + got):
+                mount(image=image, draw={**draw, "apply": gate})
+        with pytest.raises(TypeError, match=r"draw must be a dict, as .*; got 5"):
+            mount(image=image, draw=5)
     with pytest.raises(ValueError, match="count must not be negative; got -1"):
         mount.draw(-1)
+
+
+def test_a_gate_that_may_not_be_read_holds_for_lists_too(camera):
+    mount, images = RandomMount(camera=camera, p=0.5), torch.rand(3, 1, *SIZE)
+    points = [torch.rand(n, 2) * 50 for n in (2, 4, 1)]
+    draw, gates = mount.draw(3), torch.tensor([[True, False, True], [False, True, False]])
+
+    def moved(gate):
+        out = mount(image=images, keypoints=points, draw={**draw, "apply": gate})
+        return out["image"], out["keypoints"]
+
+    expected = [moved(gate) for gate in gates]
+    for given, *each in zip(torch.func.vmap(moved)(gates)[1], *(labels for _, labels in expected), strict=True):
+        torch.testing.assert_close(given, torch.stack(each))
+
+
+def test_a_gate_that_may_not_be_read_keeps_the_camera_model(camera):
+    lens = RandomLens("kannala_brandt", fov=60, p=0.5, min_filled=0)
+    source = ct.BrownConrady(camera.intrinsics, [0.1, 0, 0, 0], image_size=SIZE).requires_grad_(False)
+
+    draw, images = lens.draw(2), torch.rand(2, 1, *SIZE)
+
+    def moved(gate):
+        return lens(image=images, camera=source, draw={**draw, "apply": gate})["image"]
+
+    with pytest.raises(ValueError, match=r"the camera model must stay .*; got KannalaBrandt for BrownConrady"):
+        torch.func.vmap(moved)(torch.tensor([[True, False]]))
+
+
+def test_a_gate_that_may_not_be_read_holds_for_all_frames(camera, vision):
+    module, tv = vision
+    transform = module.Transform(RandomMount(yaw=(20, 20), camera=camera, p=0.5, min_filled=0))
+    video, points = torch.rand(5, 1, *SIZE), torch.rand(5, 3, 2) * 50
+
+    def moved(_):
+        out = transform({"video": tv.Video(video), "keypoints": points})
+        return out["video"].as_subclass(torch.Tensor), out["keypoints"]
+
+    torch.manual_seed(0)
+    pairs = zip(torch.func.vmap(moved, randomness="different")(torch.zeros(8)), (video, points), strict=True)
+    of_images, of_points = (((result - given).abs().flatten(1).amax(1) > 0.01).tolist() for result, given in pairs)
+    assert of_images == of_points
+    assert {*of_images} == {True, False}
 
 
 def test_a_camera_in_a_batch_of_one_serves_all(camera):
