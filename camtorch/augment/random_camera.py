@@ -21,7 +21,10 @@ from camtorch.warp.shifted import ShiftedWarp
 
 _SHIFTS = "shift_x", "shift_y", "shift_z"
 _DEPTHS = {"of_depth": ("depth", "z"), "of_distance": ("distance", "distance")}
-"""Names of distances in a draw, with the field of samples that holds them and its kind."""
+"""Names of distances in a draw, with the field of samples that holds them and its kind; the first one there counts.
+
+Those of a sample replace those of a draw: a draw for clips has the distances of first frames, and each frame its own.
+"""
 
 
 class RandomCamera(CameraDrawer):
@@ -139,14 +142,15 @@ class RandomMount(CameraDrawer):
             self.ranges[name] = as_range(each, "shift", self._name)
 
     def _with_labels(self, draw: Draw, rows: Callable[[], Named]) -> Draw:
-        draw = super()._with_labels(draw, rows) if self.crops else draw
+        draw = super()._with_labels(draw, rows)
         if _SHIFTS[0] not in self.ranges:
             return draw
         named = rows()
         for key, (field, _) in _DEPTHS.items():
             for found, value in named.values():
                 if found == field and isinstance(value, Tensor):
-                    return {**draw, key: value if value.ndim == 4 else value[:, None]}
+                    others = {name: v for name, v in draw.items() if name not in _DEPTHS}
+                    return {**others, key: value if value.ndim == 4 else value[:, None]}
         raise ValueError(
             f"{self._name}: with shift the sample must have depth (B, 1, H, W) or distance, as near things shift "
             f"against far ones; got {', '.join(named)}. Without shift, yaw, pitch, roll and zoom are exact"
@@ -163,13 +167,13 @@ class RandomMount(CameraDrawer):
     def _part(self, source: Camera, draw: Draw) -> Part:
         if _SHIFTS[0] not in self.ranges:
             return super()._part(source, draw)
-        key = next((key for key in reversed(_DEPTHS) if key in draw), None)
+        key = next((key for key in _DEPTHS if key in draw), None)
         if key is None:
             raise ValueError(
                 f"{self._name}: draw must have the sample's depth for shift; got none. Call the augmentation with "
                 "the sample"
             )
-        part = super()._part(source, {name: v for name, v in draw.items() if name not in (*_SHIFTS, key)})
+        part = super()._part(source, {name: v for name, v in draw.items() if name not in (*_SHIFTS, *_DEPTHS)})
         shifts = [torch.as_tensor(draw[name], dtype=torch.float64) for name in _SHIFTS]
         shift = torch.stack(shifts, -1).expand(len(draw["apply"]), 3)
         warp = ShiftedWarp(

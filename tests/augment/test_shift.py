@@ -129,6 +129,23 @@ def test_without_depth_it_says_so():
             call()
 
 
+def test_the_distances_of_a_sample_replace_those_of_a_draw():
+    camera = lens()
+    sample = sample_of(camera)
+    depth = sample["distance"] * camera.rays()[0][..., 2].clamp(min=0)
+    augment, points = ct.augment.RandomMount(shift=(0.03, 0.03, 0.03)), torch.rand(9, 2) * 100
+    draw, wrong = augment.draw(1), {name: torch.full((1, 1, 120, 160), 0.3) for name in ("of_depth", "of_distance")}
+    for fields in (sample, {**sample, "depth": depth}, {"image": sample["image"], "depth": depth, "camera": camera}):
+        alone, *beside = (
+            augment(fields, keypoints=points, draw={**draw, **given})["keypoints"]
+            for given in ({}, *({name: value} for name, value in wrong.items()), wrong)
+        )
+        assert all(torch.equal(moved, alone) for moved in beside)
+    # without a sample, as in one, depth comes before distance
+    both = augment.change(camera, {**draw, **wrong, "of_distance": sample["distance"][None]}).points(points[None])[0]
+    assert torch.equal(both, augment.change(camera, {**draw, "of_depth": wrong["of_depth"]}).points(points[None])[0])
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_labels_in_half_precision_have_the_depth_of_their_place(dtype):
     pixels, mount = (torch.rand(50, 2) * 110).to(dtype), ct.augment.RandomMount(shift=(0.03, 0.03, 0.03))
