@@ -191,11 +191,6 @@ class Part:
         return replace(moved, light=light)
 
 
-_BEFORE = {"several": ("camera_for_sample", True), "single": ("camera_for_sample", False)}
-_BEFORE["single_rotation"] = "rotation_for_sample", False
-"""Names of `Change` before 0.6: what replaces them, and whether that is for a batch."""
-
-
 def _turned(first: Tensor | None, second: Tensor | None) -> Tensor | None:
     """Return the rotation (3, 3) or (B, 3, 3) of two in turn; None is none."""
     if first is None or second is None:
@@ -210,6 +205,16 @@ def _single(camera: Camera) -> Native | None:
         return None
     rows = camera_rows(camera, *camera.tensors)
     return rows.native if rows.usable is None else None
+
+
+def _renamed(old: str, method: str, batched: bool) -> Any:
+    """Return a property of a change by its name before 0.6: what a method returns."""
+
+    def get(change: Change) -> Any:
+        warn(f"Change.{old} is now Change.{method}({batched}); 0.7 removes the old name", FutureWarning)
+        return getattr(change, method)(batched)
+
+    return property(get, doc=f"The name of `{method}({batched})` before 0.6.")
 
 
 class Change:
@@ -300,12 +305,9 @@ class Change:
             return (self.rotation if batched else self.rotation[0]).clone()
         return _eye(self.parts[0].camera.intrinsics) if rotation is None else rotation.clone()
 
-    def __getattr__(self, name: str) -> Any:
-        if name not in _BEFORE:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        method, batched = _BEFORE[name]
-        warn(f"Change.{name} is now Change.{method}({batched}); 0.7 removes the old name", FutureWarning)
-        return getattr(self, method)(batched)
+    several = _renamed("several", "camera_for_sample", batched=True)
+    single = _renamed("single", "camera_for_sample", batched=False)
+    single_rotation = _renamed("single_rotation", "rotation_for_sample", batched=False)
 
     @property
     def rotation(self) -> Tensor:

@@ -73,11 +73,19 @@ def test_what_it_gets_wrong_is_told():
         ct.augment.Augmentation(camera=camera())(keypoints=torch.zeros(1, 2))
 
 
-@pytest.mark.parametrize(("old", "new"), [("single", "camera_for_sample"), ("single_rotation", "rotation_for_sample")])
+@pytest.mark.parametrize(("old", "new"), [("single", "camera"), ("several", "camera"), ("single_rotation", "rotation")])
 def test_names_of_a_change_before_0_6_work_and_name_their_successors(old, new):
+    new, batched = f"{new}_for_sample", old == "several"
     augment = ct.augment.RandomMount(yaw=10, camera=ct.Pinhole([80.0, 80.0, 31.5, 23.5], image_size=(48, 64)))
     augment(image=torch.zeros(3, 48, 64))
-    with pytest.warns(FutureWarning, match=rf"Change\.{new}\(False\); 0\.7 removes"):
+    with pytest.warns(FutureWarning, match=rf"Change\.{old} is now Change\.{new}\({batched}\); 0\.7 removes"):
         given = getattr(augment.last, old)
-    expected = getattr(augment.last, new)(False)
+    expected = getattr(augment.last, new)(batched)
     assert torch.equal(getattr(given, "intrinsics", given), getattr(expected, "intrinsics", expected))
+
+
+def test_errors_within_a_change_are_told_as_they_are():
+    change = ct.augment.RandomMount().change(camera(), ct.augment.RandomMount().draw(2))
+    change.parts[0].camera = None
+    with pytest.raises(AttributeError, match="'NoneType' object has no attribute 'expand'"):
+        _ = change.source
