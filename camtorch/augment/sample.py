@@ -171,8 +171,11 @@ class SampleTransform(KeepsCamera, nn.Module):
         super().__setattr__(name, value)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        if state.pop("antialias", False) is None or state.pop("_warps_decide", False):  # attributes before 0.5
-            state["options"]["antialias"] = None
+        state = dict(state)
+        # before 0.5 it was one of these attributes that said to choose what to antialias
+        chosen, decides = state.pop("antialias", False), state.pop("_warps_decide", False)
+        if chosen is None or decides:
+            state["options"] = {**state["options"], "antialias": None}
         super().__setstate__(state)  # type: ignore[no-untyped-call]
         self._calls = Calls()  # which states before 0.5 lack
 

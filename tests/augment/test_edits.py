@@ -287,8 +287,11 @@ def test_only_edits_choose_what_to_antialias():
     plain = A.Resize((60, 80), antialias=False)
     for flag in ({"antialias": None}, {"_warps_decide": True}):  # of states before 0.5
         kept = A.Resize.__new__(A.Resize, (60, 80))
-        kept.__setstate__({**vars(plain), "options": dict(plain.options), **flag})
+        state = {**vars(plain), **flag}
+        kept.__setstate__(state)
         assert kept.antialias is None
+        assert flag.items() <= state.items()
+        assert state["options"]["antialias"] is plain.antialias is False
         assert torch.equal(kept(image=image)["image"], made)
     assert not torch.equal(plain(image=image)["image"], made)
 
