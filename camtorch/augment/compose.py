@@ -156,6 +156,7 @@ class Compose(Augmentation):
         return size
 
     def tell_of_empty_images(self, camera: Camera) -> None:
+        # a chain shows what the first camera sees, also where a later one, as of a crop, sees less
         for part in self.parts:
             part.tell_of_empty_images(camera)
 
@@ -173,7 +174,7 @@ class Compose(Augmentation):
                 step, edits = change_by(edits, camera, self.options), []
             else:
                 if total is not None:
-                    part_draw |= {name: _moved(total, part_draw[name], camera) for name in part.crops}
+                    part_draw |= {name: _boxes_after(total, part_draw[name], camera) for name in part.crops}
                 step = part._change(camera, part_draw)
             total = step if total is None else total.then(step)
             (first, *others) = step.parts  # a camera of all samples stays single
@@ -192,7 +193,7 @@ def _by_place(parts: Iterable[Mapping[str, T]]) -> Mapping[str, T]:
     return MappingProxyType({f"{i}.{name}": value for i, part in enumerate(parts) for name, value in part.items()})
 
 
-def _moved(change: Change, boxes: Any, camera: Camera) -> Tensor:
+def _boxes_after(change: Change, boxes: Any, camera: Camera) -> Tensor:
     """Return boxes (B, 4) after a change; a box that left the image becomes the middle of it."""
     moved, valid = (t[:, 0] for t in change.boxes(torch.as_tensor(boxes)[:, None]))
     width, height = camera.width, camera.height

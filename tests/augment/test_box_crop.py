@@ -289,3 +289,13 @@ def test_a_crop_turns_away_by_its_own_angles():
         crop = ct.augment.BoxCrop((64, 64), **{**turns, name: (20.0, 20.0)})(**sample)["rotation"]
         mount = ct.augment.RandomMount(**{**turns, name: (20.0, 20.0)}, min_filled=0)(**sample)["rotation"]
         torch.testing.assert_close(crop, mount @ straight)
+
+
+def test_a_mount_after_a_crop_shows_what_the_first_camera_sees(recwarn):
+    camera = wide().float().requires_grad_(False)
+    crop, mount = ct.augment.BoxCrop((40, 40)), partial(ct.augment.RandomMount, yaw=(25, 25), pitch=None, roll=None)
+    sample = {"image": torch.ones(1, 1, 480, 640), "boxes": torch.tensor([[[290.0, 200, 370, 280]]]), "camera": camera}
+    assert ct.augment.Compose([crop, mount()], valid_mask=True)(sample)["image_valid"].all()
+    assert not recwarn
+    with pytest.warns(UserWarning, match="RandomMount: of the new images .* will show nothing"):
+        mount()(crop(sample))
