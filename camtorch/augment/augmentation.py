@@ -316,9 +316,9 @@ class Augmentation(SampleTransform):
     def _tell_of(self, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor) -> None:
         """Warn, once, if filled parts (*B,) are less than `min_filled` with these factors (*B,) on focal lengths."""
         share = self.min_filled or 0.0
-        if self._calls.warned or not known_false(found >= share):
+        if self._calls.has_looked or not known_false(found >= share):
             return
-        self._calls.warned, few = True, int((found < share).sum())
+        self._calls.has_looked, few = True, int((found < share).sum())
         warn(
             f"{self._name}: min_filled must be within reach; got {share:g}, and of {few} of {found.numel()} new images "
             f"down to {float(found.min()):.0%} shows something: the camera of the images does not see along the axis "
@@ -327,13 +327,13 @@ class Augmentation(SampleTransform):
 
     def tell_of_empty_images(self, camera: Camera) -> None:
         """Warn, once, if new images of `camera` will be mostly empty; draws from a generator of its own show it."""
-        if self.min_filled is not None or self._calls.warned or self.p == 0:
+        if self.min_filled is not None or self._calls.has_looked or self.p == 0:
             return
         camera = self._on_host(camera)
         camera = camera[0] if camera.is_mixed else camera
         if not are_concrete(camera.intrinsics):
             return
-        self._calls.warned = True
+        self._calls.has_looked = True
         values = draw_numbers(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
         with torch.no_grad():
             first = camera.detach()
@@ -410,7 +410,7 @@ class Augmentation(SampleTransform):
         if not torch.compiler.is_compiling():
             calls = self._calls
             calls.is_first, calls.last = "rotation" not in plan.fields, change
-            if count and not calls.warned and "image" in plan.fields.values():
+            if count and not calls.has_looked and "image" in plan.fields.values():
                 self.tell_of_empty_images(camera)
         moved = self._moved(sample, batch, change)
         if self.place or PLACE in sample:
@@ -463,7 +463,9 @@ class Augmentation(SampleTransform):
         kind, boxes = found.get("boxes", next(iter(found.values()), ("boxes", None)))
         if kind != "boxes":
             boxes = [as_corners(kind, b) for b in boxes] if isinstance(boxes, list) else as_corners(kind, boxes)
-        return self.with_boxes(draw, boxes.flatten(0, -3)[:1] if getattr(boxes, "ndim", 0) > 3 else boxes)
+        if getattr(boxes, "ndim", 0) > 3:  # of the frames of one sample: those of the first frame decide
+            boxes = boxes.flatten(0, -3)[:1]
+        return self.with_boxes(draw, boxes)
 
     if TYPE_CHECKING:
 

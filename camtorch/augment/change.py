@@ -68,7 +68,7 @@ class LazyWarp:
         """The new cameras of the change; samples get copies of them."""
         if self._target is None:
             if self.target_native is not None:
-                _ = self.target_native.lenses  # reading `lenses` stores them, so that the new camera finds them
+                self.target_native.keep_lenses()  # the new camera finds them
             self._target = self.new_target()
         return self._target
 

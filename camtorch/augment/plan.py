@@ -25,9 +25,9 @@ from camtorch.warp.boxes import along_edges, around, corners_of, in_order
 from camtorch.warp.options import Options, Sampler
 from camtorch.warp.samples import Label, MovedField, SampleCall, call_for, natives_of
 
-_MIRRORED: Sequence[Label] = "boxes", "rays"
+_ALSO_MIRRORED: Sequence[Label] = "boxes", "rays"
 """Labels of a single sample that one call of C moves beside pixels, also in a mirror."""
-_TURNED: Sequence[Label] = *_MIRRORED, "columns", "pose", "rotation vectors"
+_NOT_MIRRORED: Sequence[Label] = *_ALSO_MIRRORED, "columns", "pose", "rotation vectors"
 """Those that it moves where nothing is mirrored."""
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
 
@@ -97,7 +97,7 @@ class SamplePlan:
         if isinstance(moves, LazyWarp):
             source, target, rotation, size = moves.source_native, moves.target_native, moves.rotation, moves.image_size
             if self.count == 1:
-                labels = _TURNED if moves.is_turn else _MIRRORED
+                labels = _NOT_MIRRORED if moves.is_turn else _ALSO_MIRRORED
         elif part.shades or part.light is not None or (natives := natives_of(moves)) is None:
             return {}
         else:

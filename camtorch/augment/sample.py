@@ -75,7 +75,7 @@ class Calls:
 
     last: Change | None = None
     is_first: bool = False  # whether the last sample came without a rotation
-    warned: bool = False
+    has_looked: bool = False  # whether new images were found to be filled or not: calls warn once
 
     def __init__(self) -> None:
         self.revision = object()  # key of kept plans; replaced whenever a public attribute is set
@@ -220,7 +220,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         """
         camera = sample.get("camera") if camera is None else camera
         fields = {**self.fields, **kinds} if kinds else self.fields
-        if camera is None or isinstance(camera, Guess):  # what `known_camera` says, without a call
+        if camera is None or isinstance(camera, Guess):  # as `known_camera` of `cameras.py`, without a call
             guess, camera = camera or vars(self).get("camera"), self._modules.get("camera")
             if camera is None:
                 named = moving(sample, fields, self._name)

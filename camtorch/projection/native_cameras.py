@@ -252,6 +252,10 @@ class Native:
         """The lenses of the cameras, which other cameras may share."""
         return self._find_lenses()
 
+    def keep_lenses(self) -> None:
+        """Have other cameras of the same coefficients find these lenses."""
+        _ = self.lenses
+
     def add_table(self) -> None:
         """Set the table from which the inverse of a radial factor starts."""
         if self.plan.has_factor and self.struct.table is None:
