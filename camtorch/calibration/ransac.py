@@ -21,7 +21,7 @@ _CONVINCING = 6  # points: fewer may agree by chance
 _FIRST, _NEXT = 512, 1024  # samples in the first round and in each further one
 _SURE = 10.0  # the expected number of samples without an outlier at which the search ends
 # the most samples, for points of which hardly any agree: of three points, and of four without native code
-_MOST, _MOST_OF_FOUR = 1 << 17, 1 << 14
+_MOST_SAMPLES, _MOST_SAMPLES_OF_FOUR = 1 << 17, 1 << 14
 _TRIED, _STEPS = 8, 3  # the best poses of a round, and the fits of each to the points near it
 _AT_ONCE = 1 << 19  # numbers of a tensor, at most
 _SHARED = 1 << 16  # points of samples for each further thread
@@ -101,7 +101,7 @@ def consensus(points: Tensor, rays: Tensor, slopes: Tensor, seen: Tensor, thresh
         drawn += samples
         share, few = agree[rows].clamp(min=_CONVINCING).to(costs), counts[rows].clamp(min=_CONVINCING).to(costs)
         share = torch.stack([(share - i) / (few - i) for i in range(size)]).prod(0)
-        most = _MOST_OF_FOUR if compiled is None else _MOST
+        most = _MOST_SAMPLES_OF_FOUR if compiled is None else _MOST_SAMPLES
         rows = rows[drawn * share < _SURE] if drawn < most else rows[:0]
     return best[..., :3], best[..., 3]
 

@@ -565,17 +565,8 @@ class Camera(Freezable, Editable):
 
     def __dir__(self) -> list[str]:
         """Return the names that users call, without those that a model states or that modules are made of."""
-        inside = {
-            *vars(ModelSpec),
-            *vars(CameraLike),
-            *dir(GeometryModule),
-            "each",
-            "form",
-            "memo_names",
-            "size_for",
-            "tensor_names",
-            "tensors",
-        }
+        inside = {*vars(ModelSpec), *vars(CameraLike), *dir(GeometryModule)}
+        inside |= {"each", "form", "memo_names", "size_for", "tensor_names", "tensors"}
         inside -= {"distortion_names", "is_mixed", *dir(nn.Module)}
         names: list[str] = super().__dir__()  # type: ignore[no-untyped-call]
         return [n for n in names if n not in inside and (n[:1] != "_" or n[:2] == "__")]

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.cameras.image_sizes import (
-    CENTRED,
-    LOOKED_AT,
-    SIZE_LIKE,
+    CAMERAS_LOOKED_AT,
+    CENTRED_SHARE,
+    LEAST_SIDE,
     Rows,
     off_centre,
     off_middle,
@@ -41,7 +41,7 @@ _Checked = tuple[Tensor, Tensor, tuple[str, ...], torch.Size, tuple[int, int] | 
 
 _OF_CALIBRATE_CAMERA = 5, 8, 12, 14  # OpenCV's numbers of coefficients; 4 may be of its fisheye, too
 _DTYPES, _NUMBERS = (torch.float32, torch.float64), {float, int}
-_LARGE = 1e30  # float32 can hold it, and NaN is not below it
+_MOST_SUM = 1e30  # float32 can hold it, and NaN is not below it
 
 
 def checked_numbers(
@@ -72,12 +72,12 @@ def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: 
     """
     if not (model.always_defined and are_free(*[value for value in (intrinsics, distortion) if type(value) is Tensor])):
         return None
-    if (given := _plain_rows(intrinsics, _LARGE)) is None:
+    if (given := _plain_rows(intrinsics, _MOST_SUM)) is None:
         return None
     numbers, rows = given
     if distortion is None and not model.default_count:
         k = numbers.new_empty(*numbers.shape[:-1], 0)
-    elif (given := _plain_rows(distortion, SIZE_LIKE)) is not None:
+    elif (given := _plain_rows(distortion, LEAST_SIDE)) is not None:
         k = given[0]
     else:
         return None
@@ -87,7 +87,7 @@ def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: 
     if size is not None and not (type(size) is tuple and [*map(type, size)] == [int, int] and min(size) > 0):
         return None
     for fx, fy, cx, cy in rows:
-        if not (fx > 0 and fy > 0 and (size is None or off_middle(cx, cy, size) <= CENTRED)):
+        if not (fx > 0 and fy > 0 and (size is None or off_middle(cx, cy, size) <= CENTRED_SHARE)):
             return None
     return numbers, k, names, numbers.shape[:-1], size
 
@@ -101,7 +101,7 @@ def _plain_rows(value: Any, most: float) -> tuple[Tensor, Rows] | None:
         tensor, rows = torch.empty(len(value)), [value]
     elif type(value) is Tensor and value.ndim == 1 and not value.requires_grad:
         tensor, rows = value.clone(), [value.tolist()]
-    elif type(value) is Tensor and value.ndim == 2 and 0 < len(value) <= LOOKED_AT and not is_predicted(value):
+    elif type(value) is Tensor and value.ndim == 2 and 0 < len(value) <= CAMERAS_LOOKED_AT and not is_predicted(value):
         tensor, rows = value.clone(), value.tolist()
     else:
         return None
@@ -143,7 +143,7 @@ def checked_distortion(model: type[CameraLike], distortion: Numbers, intrinsics:
     owner = model.__name__
     distortion = as_real(distortion, "distortion", owner, intrinsics.device)
     row = row_of(distortion)
-    if row is not None and len(row) == 2 and min(row) >= SIZE_LIKE and all(map(float.is_integer, row)):
+    if row is not None and len(row) == 2 and min(row) >= LEAST_SIDE and all(map(float.is_integer, row)):
         raise ValueError(f"{owner}: distortion must not be an image size; got {row}. Use image_size=(height, width)")
     if not model.distortion_names and distortion.numel():
         raise ValueError(

@@ -164,7 +164,7 @@ def _mat_sample(samples: Samples, path: Path) -> Sample:
 
 
 _NONE = np.zeros(0)
-_MATRIX, _COMPRESSED, _LARGEST = 14, 15, 1 << 26  # bytes of a file; those of 300W-LP have some thousands
+_MATRIX, _COMPRESSED, _LARGEST_FILE = 14, 15, 1 << 26  # bytes of a file; those of 300W-LP have some thousands
 _TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8", 13: "<u8"}
 
 
@@ -174,14 +174,14 @@ def _matlab(path: Path) -> dict[str, np.ndarray[Any, Any]]:
     scipy is not used: its reader crashes the process for some damaged files.
     """
     with path.open("rb") as file:
-        content = file.read(_LARGEST)
+        content = file.read(_LARGEST_FILE)
     if content[:6] != b"MATLAB" or content[126:128] != b"IM":
         raise ValueError(f"{path}: must be a file of Matlab 5 to 7, of save -v7; got {content[:20]!r}")
     found = {}
     with _failing_at(path, "not a whole file of Matlab: ", ValueError, struct.error, zlib.error):
         for kind, part in _elements(content[128:]):
             if kind == _COMPRESSED:
-                kind, part = next(_elements(zlib.decompressobj().decompress(part, _LARGEST)), (0, b""))
+                kind, part = next(_elements(zlib.decompressobj().decompress(part, _LARGEST_FILE)), (0, b""))
             parts = list(_elements(part)) if kind == _MATRIX else []
             if len(parts) > 3 and parts[3][0] in _TYPES:  # flags, shape, name, numbers
                 shape, numbers = np.frombuffer(parts[1][1], "<i4"), np.frombuffer(parts[3][1], _TYPES[parts[3][0]])

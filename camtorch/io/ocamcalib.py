@@ -19,7 +19,7 @@ _LINES = ("polynomial", "inverse polynomial", "centre", "affine", "image size")
 _NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE)
 _MOST_TERMS = 64
 _START = 1 << 14  # bytes in which the kind of a file is visible
-_LARGEST = 1 << 16
+_LARGEST_FILE = 1 << 16
 
 
 def matches(path: str, content: bytes) -> bool:
@@ -32,8 +32,8 @@ def matches(path: str, content: bytes) -> bool:
 
 def read(path: str, content: bytes) -> Rig:
     """Return the only camera of a file; lines after the size, which some programs add, are not read."""
-    if len(content) > _LARGEST:
-        raise CameraFileError(path, "size", f"must be at most {_LARGEST} bytes; got {len(content)}")
+    if len(content) > _LARGEST_FILE:
+        raise CameraFileError(path, "size", f"must be at most {_LARGEST_FILE} bytes; got {len(content)}")
     lines = [line.split() for line in decoded(path, content).splitlines()]
     if len(rows := [line for line in lines if line and not line[0].startswith("#")]) < len(_LINES):
         raise CameraFileError(path, _LINES[len(rows)], "must be given; got no such line")

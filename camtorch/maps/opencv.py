@@ -24,7 +24,7 @@ from camtorch.maps.lookup import Exact, LookupMap
 from camtorch.maps.protocol import MOST_PIXELS, SIZES, MapFormat, checked
 
 _NOWHERE = -32768
-_LONGEST = 32766  # pixels: cv2.remap needs sides below SHRT_MAX
+_LONGEST_SIDE = 32766  # pixels: cv2.remap needs sides below SHRT_MAX
 _PARTS = 32  # of a pixel
 _LARGEST_ARRAY = 8 * MOST_PIXELS
 # matrices in YAML, with their data in base64
@@ -44,8 +44,10 @@ class OpenCV(MapFormat):
 
     def encode(self, path: str, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
         sides = (*exact.source_size, *exact.target_size)
-        if max(sides) > _LONGEST:
-            raise CameraFileError(path, "size", f"sides must be at most {_LONGEST} px for cv2.remap; got {max(sides)}")
+        if max(sides) > _LONGEST_SIDE:
+            raise CameraFileError(
+                path, "size", f"sides must be at most {_LONGEST_SIDE} px for cv2.remap; got {max(sides)}"
+            )
         positions = exact.positions.clip(_NOWHERE, -_NOWHERE - 1)
         positions[~exact.mapped] = _NOWHERE
         if self.name == "opencv_fixed":

@@ -10,7 +10,7 @@ from camtorch.maps.lookup import Exact, LookupMap
 
 MOST_PIXELS = 1 << 26  # of a map that is read: 8192 x 8192
 SIZES = "source_height", "source_width", "target_height", "target_width"  # keys in files and descriptions
-_LONGEST = 1 << 16  # pixels along a side
+_LONGEST_SIDE = 1 << 16  # pixels
 
 
 class MapFormat(ABC):
@@ -41,7 +41,7 @@ class MapFormat(ABC):
 def checked(name: str, size: Any) -> tuple[int, int]:
     """Return the (height, width) of a file or its description; raise a ValueError if it is no such pair."""
     sides = tuple(size)
-    whole = all(isinstance(side, int) and 0 < side <= _LONGEST for side in sides)
+    whole = all(isinstance(side, int) and 0 < side <= _LONGEST_SIDE for side in sides)
     if len(sides) != 2 or not whole or sides[0] * sides[1] > MOST_PIXELS:
         raise ValueError(f"{name} must be (height, width) of at most {MOST_PIXELS} pixels; got {size!r:.60}")
     return sides[0], sides[1]

@@ -25,8 +25,8 @@ from camtorch.maps.mesh import Mesh, Table, rounded, table
 
 _PARTS = 8
 _LOW, _HIGH = -(1 << 15), (1 << 15) - 1
-_ALIGNED = 16  # bytes
-_LARGEST = 8192  # pixels along a side
+_ALIGNMENT_BYTES = 16
+_LARGEST_SIDE = 8192  # pixels
 _BLOCKS = ((64, 64), (32, 64), (32, 32), (16, 32), (16, 16), (8, 16), (8, 8), (4, 8), (2, 8))  # height, width
 _MOST_PADDING = 15  # four bits
 _BEFORE, _AFTER = 1, 2  # pixels around the whole part of a position that a bicubic filter reads
@@ -41,8 +41,8 @@ class TILDC(Table):
     steps: tuple[int, ...] = tuple(1 << m for m in range(8))
 
     def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        if max(*exact.source_size, *exact.target_size) > _LARGEST:
-            raise CameraFileError(path, "size", f"sides must be at most {_LARGEST} px for the LDC; got more")
+        if max(*exact.source_size, *exact.target_size) > _LARGEST_SIDE:
+            raise CameraFileError(path, "size", f"sides must be at most {_LARGEST_SIDE} px for the LDC; got more")
         (n, m), places = mesh.nodes.shape[:2], mesh.places
         limits = places + _LOW / _PARTS, places + _HIGH / _PARTS
         parts = rounded(path, self.name, mesh, exact, _PARTS, *limits, bool(options.get("clip")))
@@ -61,7 +61,7 @@ class TILDC(Table):
 
 def _pitch(columns: int) -> int:
     """Return the bytes from line to line."""
-    return -(-4 * columns // _ALIGNED) * _ALIGNED
+    return -(-4 * columns // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES
 
 
 def _fetched(path: str, positions: Floats, source: tuple[int, int]) -> tuple[tuple[int, int], int, tuple[int, int]]:

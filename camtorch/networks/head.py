@@ -20,7 +20,7 @@ from camtorch.values.arguments import as_coordinates, as_flag, as_image_size, as
 from camtorch.values.module import GeometryModule, typed_as
 
 _ASPECT = 0.1
-_LARGEST = 1e6  # a number whose square is finite, and whose gradient is negligible
+_LARGEST_NUMBER = 1e6  # its square is finite, and its gradient negligible
 _NODES = 33
 
 
@@ -156,7 +156,7 @@ class CameraHead(GeometryModule):
         means = f", {', '.join(self.names)}"
         numbers = as_coordinates(numbers, "numbers", len(self.names), owner, form="*B", means=means)
         dtype = torch.promote_types(numbers.dtype, torch.float32)
-        rows = precise(numbers.to(dtype).reshape(-1, len(self.names)).clamp(-_LARGEST, _LARGEST))
+        rows = precise(numbers.to(dtype).reshape(-1, len(self.names)).clamp(-_LARGEST_NUMBER, _LARGEST_NUMBER))
         first = len(self.names) - len(self._coefficients)
         given, free = rows[:, :first], rows[:, first:]
         least, most = self._discs[0].to(rows), self._discs[-1].to(rows)

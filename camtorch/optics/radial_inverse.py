@@ -21,7 +21,7 @@ from camtorch.values.arguments import columns
 RADII = 1024  # at which a factor is followed to its fold
 _PARTS = 256  # of the interval with a fold, divided twice before the secant
 TABLE_WIDTH = 2 + 2 * NODES  # columns of `tabulate`
-_LIMITING = 16  # square roots of a radius, the most that are taken until its image is a number
+_MOST_ROOTS = 16  # square ones, that are taken of a radius until its image is a number
 _HALF_WAY = 2.0  # the squared radius in the middle of the table of a lens that never folds
 MOST_STEPS = 5  # of Newton's method; slower methods finish what still moves
 WITHOUT_FLOAT64 = ("mps",)  # types of devices
@@ -76,7 +76,7 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
         if bool((good := is_number(fold)).all()):
             return fold
         low, high = fold, fold
-        for _ in range(_LIMITING):
+        for _ in range(_MOST_ROOTS):
             low = torch.where(good | is_number(low), low, torch.where(low > 2, low.sqrt(), low / 2))
         for _ in range(64):
             middle = low.sqrt() * high.sqrt()

@@ -276,7 +276,14 @@ def native_of(
     """
     if library() is None or not intrinsics.is_cpu or not k.shape[0]:
         return None
-    plan = _plans((), (optics_of, k.shape[-1]), lambda: _plan_of(optics_of, k))
+
+    def planned() -> ModelPlan | None:
+        given = [c.clone() for c in columns(k[:1].double())]
+        chart, lens = optics_of(given)
+        parts = codes(chart, lens)
+        return None if parts is None else ModelPlan(chart, lens, parts, given)
+
+    plan = _plans((), (optics_of, k.shape[-1]), planned)
     if plan is None:
         return None
     lenses = lenses_of(plan, k, lambda: Lenses.of(plan, optics_of, k, domain, tables))
@@ -284,13 +291,6 @@ def native_of(
     struct.intrinsics = struct.keep(intrinsics.contiguous())
     struct.usable = None if usable is None else struct.keep((usable > 0).contiguous())
     return Native(plan, struct, lambda: lenses)
-
-
-def _plan_of(optics_of: Optics, k: Tensor) -> ModelPlan | None:
-    given = [c.clone() for c in columns(k[:1].double())]
-    chart, lens = optics_of(given)
-    parts = codes(chart, lens)
-    return None if parts is None else ModelPlan(chart, lens, parts, given)
 
 
 def codes(chart: Chart, lens: Lens) -> list[structs.Part] | None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens
 
-_MOST_LOOKED_AT = 512  # numbers that are checked one by one
+_NUMBERS_LOOKED_AT = 512  # one by one
 
 
 class CameraRows:
@@ -55,7 +55,10 @@ class CameraRows:
     def domain(self) -> Domain:
         """The domain in which the lenses are one-to-one; see `Domain`."""
         if self._same_on_cpu is not None and (native := self._same_on_cpu.native) is not None:
-            return Domain(self.model.optics, self.k, _sent_tables(native, self.k.device))
+            made = native.lenses.tables()
+            there = sent([*made.values()], self.k.device) if made else ()
+            by = way_of_inverse(native.plan.is_radial, made.get("stagewise"))
+            return Domain(self.model.optics, self.k, {**dict(zip(made, there, strict=True)), "inverse_by": by})
         return domain_for(self.model, self.k, self._learns)
 
     def as_constant(self) -> CameraRows:
@@ -117,17 +120,9 @@ def _constant_tables(domain: Domain) -> dict[str, Any]:
     return {**known, "inverse": inverse, "inverse_by": domain.inverse_by}
 
 
-def _sent_tables(native: Native, device: torch.device) -> dict[str, Any]:
-    """Return the properties of a domain that native code made on the CPU, on another device."""
-    made = native.lenses.tables()
-    there = sent([*made.values()], device) if made else ()
-    by = way_of_inverse(native.plan.is_radial, made.get("stagewise"))
-    return {**dict(zip(made, there, strict=True)), "inverse_by": by}
-
-
 def _are_plain(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> bool:
     """Whether a short look shows that all are usable."""
-    if not intrinsics.is_cpu or not 0 < intrinsics.numel() + distortion.numel() <= _MOST_LOOKED_AT:
+    if not intrinsics.is_cpu or not 0 < intrinsics.numel() + distortion.numel() <= _NUMBERS_LOOKED_AT:
         return False
     if distortion.numel() and not model.always_defined and model.defined(distortion.unbind(-1)) is not None:
         return False

@@ -67,21 +67,16 @@ def _invert_in_plane(domain: Domain, u: Tensor, v: Tensor) -> Found:
 
 def _invert_stagewise(domain: Domain, u: Tensor, v: Tensor) -> Found:
     """Invert the later stages first, as only the radial one has a limit. Pixels beyond every ray are not solved for."""
-    first, within = _first_image(domain, u, v)
+    rest = present(domain.lens.rest, "a later stage")
+    within = domain.image_circle_sq - torch.addcmul(u * u, v, v)
+    mask = to_mask(within, may_branch_on(u))
+    u, v = replace(mask, u, 0.0), replace(mask, v, 0.0)
+    first = _newton(rest, u, v, *rest.start(u, v))
     found = _invert_radial(domain, first.a, first.b)
     known = first.solved > 0
     possible = torch.minimum(torch.where(known, found.possible, 1.0), within)
     solved = torch.where(known, torch.minimum(found.solved, within), -1.0)
     return found._replace(solved=solved, possible=possible)
-
-
-def _first_image(domain: Domain, u: Tensor, v: Tensor) -> tuple[Found, Tensor]:
-    """Return the points that the stages after the first one send to (u, v), and a margin of the image's circle."""
-    rest = present(domain.lens.rest, "a later stage")
-    within = domain.image_circle_sq - torch.addcmul(u * u, v, v)
-    mask = to_mask(within, may_branch_on(u))
-    u, v = replace(mask, u, 0.0), replace(mask, v, 0.0)
-    return _newton(rest, u, v, *rest.start(u, v)), within
 
 
 def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:

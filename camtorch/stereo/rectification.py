@@ -38,7 +38,7 @@ _KINDS: dict[str, tuple[tuple[type[Camera], type[Camera]], tuple[float, float]]]
 }
 _PARALLEL = 1e-6  # the part of the view direction across the baseline below which it counts as zero
 _STEP = 1e-4  # on the plane of a projection, for finite differences of its scale
-_LARGEST = 8  # times the longest side of a camera, at most, for a default image_size
+_MOST_ENLARGED = 8  # times the longest side of a camera, at most, for a default image_size
 
 
 class Rectification(GeometryModule):
@@ -253,7 +253,7 @@ def rectify(
         if size is None:
             sides = (extent * focal[..., None]).reshape(-1, 2).amax(0).round().clamp(min=2)
             size = int(sides[1]), int(sides[0])
-            if max(size) > _LARGEST * max(left.height, left.width, right.height, right.width):
+            if max(size) > _MOST_ENLARGED * max(left.height, left.width, right.height, right.width):
                 raise ValueError(
                     f"rectify: image_size must be given, as the default is too large; got {size}. Pass (height, width) "
                     "and check that extrinsics are right from left, and that no camera looks along the baseline"
