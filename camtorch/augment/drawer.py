@@ -53,7 +53,8 @@ _LIMITS: dict[str, dict[str, Any]] = {
 }
 """The options of `as_range` for each range, in the order in which they are drawn."""
 _EXACT = "fov", "crop", "vignetting", "cos4"  # a number x of these means (x, x), not a range around nothing
-_AUTO = "focal", "centre", "distortion", "crop"
+_AUTO = "focal", "centre", "distortion", "crop"  # ranges that "auto" may stand for
+_REAL_LENS = KannalaBrandt([1.0, 1.0, 0.0, 0.0]).detach()  # of the model of real lenses, with other numbers
 
 
 class LensOptions(EditOptions, total=False):
@@ -102,12 +103,16 @@ class CameraDrawer(Augmentation):
         self._memo = Kept(8)
         self.image_size: tuple[int, int] | None = as_image_size(image_size, self._name)
         self._is_real = isinstance(like, str) and like == REAL
-        usual = {} if self._is_real else self._usual_ranges
-        values = {n: usual.get(n) if n in _AUTO and isinstance(v, str) and v == "auto" else v for n, v in given.items()}
-        values |= {"chromatic": chromatic, "vignetting": vignetting, "cos4": cos4}
-        values |= {"fov": None} if self.fov else {}
-        values |= {"lens": (0, 1)} if self._is_real else {}
-        values |= {"place": (0, 1)} if values.get("crop") is not None else {}
+        values = {**given, "chromatic": chromatic, "vignetting": vignetting, "cos4": cos4}
+        for name in _AUTO:
+            if isinstance(values.get(name), str) and values[name] == "auto":
+                values[name] = None if self._is_real else self._usual_ranges.get(name)
+        if self.fov:
+            values["fov"] = None
+        if self._is_real:
+            values["lens"] = 0, 1
+        if values.get("crop") is not None:
+            values["place"] = 0, 1
         self.ranges: dict[str, Range] = {}
         for name, limit in _LIMITS.items():
             if (value := values.get(name)) is not None:
@@ -145,7 +150,7 @@ class CameraDrawer(Augmentation):
         """Whether new cameras follow from the formulas of this class; a subclass may have another `new_camera`."""
         return type(self).new_camera is CameraDrawer.new_camera
 
-    drawn_on_host = _keeps_formulas
+    drawn_on_host = _keeps_formulas  # the formulas take numbers alone
 
     def _like_for(self, source: Camera) -> Camera | None:
         """Return `like`, on the CPU if the source is there and its numbers are known; None without `like`."""
@@ -183,9 +188,9 @@ class CameraDrawer(Augmentation):
             fx, fy, cx, cy = fx / share, fy / share, (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
         intrinsics = _joined((fx, fy, cx, cy), distortion)
         target = remade(base, intrinsics=intrinsics, distortion=distortion, image_size=size)
-        none = next((0 * values[name] for name in _TURNS if name in values), None)
-        if none is None:
+        if not (turns := [values[name] for name in _TURNS if name in values]):
             return target, None
+        none = 0 * turns[0]
         angles = [torch.deg2rad(values.get(name, none)) for name in _TURNS]
         elements = mount_elements([angle.cos() for angle in angles], [angle.sin() for angle in angles])
         return target, _joined(elements, source.intrinsics).unflatten(-1, (3, 3))
@@ -217,18 +222,17 @@ class CameraDrawer(Augmentation):
         first = next(iter(values.values()), None)
         if isinstance(first, Tensor) or (first is None and not are_numbers()) or not hold_numbers(tensors):
             return None
-        start = partial(self._start, source, values)
-        if self._is_real:
-            found = start()
+        if self._is_real:  # each draw has a lens of its own
+            start = self._start(source, values)
         else:
             # all else that new cameras depend on
             sizes = source.image_size, None if like is None else like.image_size
             key = "start", type(source), *sizes, self._calls.revision, self.ranges.get("fov"), self.min_filled, *values
             known = self._memo.entry(tensors, key)
-            found = self._memo(tensors, key, start) if known is None else known.result
-        if found is None:
+            start = self._memo(tensors, key, partial(self._start, source, values)) if known is None else known.result
+        if start is None:
             return None
-        return found.warp(values, source if like is None and not self._is_real else found.base, self._warp_options)
+        return start.warp(values, source if like is None and not self._is_real else start.base, self._warp_options)
 
     def _start(self, source: Camera, values: Mapping[str, Any]) -> Start | None:
         """Return what native code starts from for values of these names; None if it lacks a range, or a model."""
@@ -244,7 +248,7 @@ class CameraDrawer(Augmentation):
         """Return the part with the effect of the lens on colours and light."""
         beside = self._as_tensors(source, {name: values[name] for name in self.beside_the_camera.intersection(values)})
         cameras, light = [target], None
-        if "chromatic" in beside:
+        if "chromatic" in beside:  # red and blue are seen by cameras of their own
             cameras += [scaled(target, 1 + beside["chromatic"][..., i]) for i in (0, 1)]
         warp, *others = [Warp.of_valid(source, camera, self._warp_options).turned_by(rotation) for camera in cameras]
         if "vignetting" in beside:
@@ -256,9 +260,9 @@ class CameraDrawer(Augmentation):
 
     def _tell_of(self, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor) -> None:
         super()._tell_of(source, target, factor, found)
-        asked = self._among[0] if self._among else self.ranges["fov"].low if "fov" in self.ranges else None
-        if asked is not None:
-            tell_of_narrow_images(self._name, asked, self.min_filled or 0.0, source, target, factor, found)
+        least = self._among[0] if self._among else self.ranges["fov"].low if "fov" in self.ranges else None
+        if least is not None:
+            tell_of_narrow_images(self._name, least, self.min_filled or 0.0, source, target, factor, found)
 
     def _size_of(self, source: Camera) -> tuple[int, int]:
         return self.image_size or source.size_for(self._name)
@@ -273,7 +277,7 @@ class CameraDrawer(Augmentation):
         dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
         if self._is_real:
             lens = drawn(torch.as_tensor(share, dtype=dtype, device=device), size, self._among)
-            base = remade(_ANY, intrinsics=lens.intrinsics, distortion=lens.distortion, image_size=size)
+            base = remade(_REAL_LENS, intrinsics=lens.intrinsics, distortion=lens.distortion, image_size=size)
             covered_radius = lens.reach
         if any(t.dtype != dtype or t.device != device for t in base.tensors):
             base = base.each(lambda t: t.to(device, dtype))
@@ -344,6 +348,3 @@ def _as_wide(base: Camera, sized: Tensor, fov: Tensor, width: int) -> Tensor:
     ratio = width / (pixels[..., 1, 0] - pixels[..., 0, 0])
     focal = precise(base.intrinsics)[..., :2] * ratio.unsqueeze(-1)
     return torch.cat(torch.broadcast_tensors(focal, sized[..., 2:]), -1)
-
-
-_ANY = KannalaBrandt([1.0, 1.0, 0.0, 0.0]).detach()
