@@ -36,10 +36,11 @@ from camtorch.values.arguments import is_list
 _LEAST_SHARED_BYTES = 1 << 16
 """Bytes below which a tensor goes within the message."""
 _MOST_BLOCKS = 32
-"""Blocks that wait, and blocks that others have: for those who keep more batches than that, memory is torch's own."""
-_HOME = 0  # the last byte of a block: this process may use it again
-_AWAY = 1  # another process has it
-_LOST = 2  # a fork has it for good
+"""Blocks that are idle, and blocks that are away: for those who keep more batches than that, memory is torch's own."""
+# the last byte of a block
+_HOME = 0  # it is idle or held
+_AWAY = 1
+_LOST = 2
 
 
 def collate(samples: Sequence[object]) -> object:
@@ -112,9 +113,9 @@ class _Block:
         os.ftruncate(self.file, size + 1)
         self.memory = _mapped(os.getpid(), self.file, size)
 
-    def back(self, place: int) -> None:
-        """Take the block back, since its batch died."""
-        del _held[place]
+    def batch_died(self, address: int) -> None:
+        """Be held no more: the block is away if its batch was sent, and else idle, as its last byte says."""
+        del _held[address]
         _away.append(self)
 
 
@@ -123,8 +124,8 @@ _held: dict[int, _Block] = {}
 _away: list[_Block] = []
 """Blocks in which another process may have a tensor."""
 _idle: list[_Block] = []
-_lock = threading.Lock()  # of the lists; `back` goes without it: a tensor may die wherever Python collects garbage
-_forks = 0
+_lock = threading.Lock()  # of the lists; `batch_died` goes without it: tensors die wherever Python collects garbage
+_forks = 0  # grows with each fork; blocks of before may have a tensor in the fork
 
 
 def _is_plain(value: Any) -> bool:
@@ -142,24 +143,25 @@ def _stacked(batch: Sequence[Tensor]) -> Tensor | None:
     like = torch.empty(len(batch), *first.shape, dtype=first.dtype, device="meta")
     if like.nbytes < _LEAST_SHARED_BYTES:
         return torch.stack(list(batch)).as_subclass(_Sent)
-    block = _block(like.nbytes)
+    block = _free_block(like.nbytes)
     if block is None:
         return None
-    place = torch.frombuffer(block.memory, dtype=torch.uint8).data_ptr()
-    _held[place] = block
-    result = tensor_on(block.memory, like.dtype, like.shape, like.stride(), functools.partial(block.back, place))
+    address = torch.frombuffer(block.memory, dtype=torch.uint8).data_ptr()
+    _held[address] = block
+    died = functools.partial(block.batch_died, address)
+    result = tensor_on(block.memory, like.dtype, like.shape, like.stride(), died)
     return torch.stack(list(batch), out=result).as_subclass(_Sent)
 
 
-def _block(size: int) -> _Block | None:
+def _free_block(size: int) -> _Block | None:
     """Return a free block of `size` bytes; None if the system or the user requires torch's own way of sharing."""
-    if get_sharing_strategy() == "file_system" or not _is_open(os.getppid()):
+    if get_sharing_strategy() == "file_system" or not _can_open_files_of(os.getppid()):
         return None
     with _lock:
         for block in [block for block in _away if block.memory[-1] != _AWAY]:
             _away.remove(block)
             _idle.append(block)
-        _idle[:] = [block for block in _idle if block.memory[-1] == _HOME and block.forks == _forks]
+        _idle[:] = [block for block in _idle if block.memory[-1] == _HOME and block.forks == _forks]  # else lost
         for i in reversed(range(len(_idle))):
             if _idle[i].size == size:
                 return _idle.pop(i)
@@ -172,7 +174,7 @@ def _block(size: int) -> _Block | None:
 
 
 @functools.cache
-def _is_open(process: int) -> bool:
+def _can_open_files_of(process: int) -> bool:
     """Whether files of such a process can be opened by others of the same user, as Linux has it."""
     try:
         return hasattr(os, "memfd_create") and bool(os.listdir(f"/proc/{process}/fd"))
@@ -181,26 +183,28 @@ def _is_open(process: int) -> bool:
 
 
 def _mapped(process: int, file: int, size: int) -> mmap.mmap:
+    """Return the memory of a block, with its last byte, by the number that a process has for its file."""
     with open(f"/proc/{process}/fd/{file}", "r+b", buffering=0) as opened:
         return mmap.mmap(opened.fileno(), size + 1)
 
 
-def _reduced(sent: _Sent) -> tuple[Callable[..., Tensor], tuple[Any, ...]]:
+def _reduction(sent: _Sent) -> tuple[Callable[..., Tensor], tuple[Any, ...]]:
     """Return the function and arguments by which another process makes the tensor."""
-    block, what = _held.get(sent.data_ptr()), (sent.dtype, tuple(sent.shape))
+    block, form = _held.get(sent.data_ptr()), (sent.dtype, tuple(sent.shape))
     if sent.is_contiguous() and not sent.requires_grad:
         if block is not None and block.memory[-1] == _HOME:
             block.memory[-1] = _AWAY
-            return _arrived, (os.getpid(), block.file, block.size, *what)
+            return _tensor_of_block, (os.getpid(), block.file, block.size, *form)
         if sent.nbytes < _LEAST_SHARED_BYTES:
-            return _unpacked, (sent.reshape(-1).view(torch.uint8).numpy().tobytes(), *what)
+            return _tensor_of_bytes, (sent.reshape(-1).view(torch.uint8).numpy().tobytes(), *form)
     reduced: tuple[Callable[..., Tensor], tuple[Any, ...]] = reduce_tensor(
         sent.detach().as_subclass(Tensor).clone().requires_grad_(sent.requires_grad)
     )
     return reduced
 
 
-def _arrived(process: int, file: int, size: int, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+def _tensor_of_block(process: int, file: int, size: int, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+    """Return the tensor that a worker sent in a block, which is the worker's again when the tensor dies."""
     memory, forks = _mapped(process, file, size), _forks
 
     def died() -> None:
@@ -209,7 +213,7 @@ def _arrived(process: int, file: int, size: int, dtype: torch.dtype, shape: tupl
     return tensor_on(memory, dtype, shape, torch.empty(shape, device="meta").stride(), died)
 
 
-def _unpacked(data: bytes, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+def _tensor_of_bytes(data: bytes, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
     if not data:
         return torch.empty(shape, dtype=dtype, device="cpu")
     return torch.frombuffer(bytearray(data), dtype=dtype).view(shape)
@@ -221,6 +225,6 @@ def _forked() -> None:
     _forks += 1
 
 
-ForkingPickler.register(_Sent, _reduced)
+ForkingPickler.register(_Sent, _reduction)
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_forked, after_in_parent=_forked, after_in_child=_forked)  # threads go on in between
