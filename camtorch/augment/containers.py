@@ -113,7 +113,7 @@ def _fields_moved(part: Any, fields: Sample, params: Params, kinds: dict[str, st
     with torch.autocast(device.type, enabled=False):
         change = part.change(params, device)
         moved = part.augmentation.moved_by(change.inverse() if back else change, flat, kinds, predicted=back)
-    if PLACE in fields:
+    if PLACE in fields and not back:
         put_place(flat, moved, type(part).__name__)
     kept = {n: v for n, v in moved.items() if n in fields or n.removesuffix("_valid") in kinds}
     return {n: v.unflatten(0, (clips, -1)) for n, v in kept.items()} if clips else type(fields)(kept)

@@ -167,6 +167,7 @@ class Transform(FrontEnd, v2.Transform):
                 problems[i] = error
         if "image" not in kinds.values():
             named = {name for name in names if name in fields or name.endswith("_valid") or pattern_of(name, fields)}
+            named.add(PLACE)
             free = (i for i, kind in kinds.items() if not (kind or names[i] in named))
             first = next((i for i in free if isinstance(flat[i][1], Tensor) and flat[i][1].ndim > 1), -1)
             kinds |= {} if first < 0 else {first: "image"}

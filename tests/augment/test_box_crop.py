@@ -204,6 +204,10 @@ def test_the_place_goes_on_in_torchvision(vision):
     np.testing.assert_allclose(apply(flip, {"a": arrays})["a"]["crop_place"], want, atol=1e-6)
     with pytest.raises(ValueError, match="crop_place must have the rotation"):
         apply(flip, {name: value for name, value in cropped.items() if name != "rotation"})
+    several = crop({name: torch.stack([without[name]] * 2) for name in without}, camera=sample["camera"])
+    labels = {name: several[name] for name in ("crop_place", "rotation")}  # the place is no image
+    labels["camera"] = several["camera"][0]
+    torch.testing.assert_close(apply(flip, labels)["crop_place"], torch.stack([want] * 2))
     with pytest.raises(ValueError, match="must have one crop_place; got 2"):
         apply(flip, {**cropped, "other": {"crop_place": want}})
 
