@@ -198,6 +198,10 @@ class CameraDrawer(Augmentation):
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         if not self._keeps_formulas:
             return super()._new_camera(source, values)
+        for name, one in self.ranges.items():  # which may have been set since
+            if name in _LIMITS and one.size != (size := _LIMITS[name].get("size")):
+                wanted = "Range(low, high)" if size is None else f"Range(low, high, {size})"
+                raise ValueError(f"{self._name}: the range {name!r} must be {wanted}; got {one!r}")
         example = precise(source.intrinsics.detach())
         kind: dict[str, Any] = {"dtype": example.dtype, "device": example.device}  # as_tensor makes float32 of floats
         return self.new_camera(source, {name: torch.as_tensor(value, **kind) for name, value in values.items()})

@@ -190,13 +190,25 @@ class Start:
         if given and isinstance(given[0], np.ndarray):
             batch = self._batch or (len(given[0]),)
             given = np.concatenate(given, None)
+            self._check_count(len(given), batch[0])
             return _array(c_double, len(given)).from_buffer(given), batch
         if len(given) < self._drawn:  # some values are several numbers
             flat: list[float] = []
             for value in given:
                 flat += value if isinstance(value, list) else (value,)
             given = flat
+        if len(given) != self._drawn:
+            self._check_count(len(given), 1)
         return _array(c_double, len(given))(*given), self._batch
+
+    def _check_count(self, count: int, rows: int) -> None:
+        """Raise a ValueError unless so many numbers are what cameras are made of, as C reads all of them."""
+        if count != self._drawn * rows:
+            sizes = ", ".join(f"{name} as Range(low, high, {size})" for name, size in _SIZES.items())
+            raise ValueError(
+                f"ranges must draw {self._drawn} numbers for a sample, {sizes}, and others as Range(low, high); got "
+                f"{count} for {rows} samples"
+            )
 
     def _complete(self, left: int, values: Mapping[str, Any], call: structs.Draws, candidates: Native | None) -> None:
         """Compute the limits and ends that C lacked, of new lenses and of the cameras that it starts from."""

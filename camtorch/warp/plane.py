@@ -111,6 +111,12 @@ class PlaneWarp(Warp):
         pose = self.extrinsics.rotation, self.extrinsics.translation
         return [*self.source.tensors, *self.target.tensors, *pose, self.normal, self.distance]
 
+    def transform_positions(self, points: Tensor) -> Tensor:
+        raise TypeError(f"{type(self).__name__}: only pixels and rays of the plane move; got points")
+
+    def moved_distance(self, distance: Tensor) -> Tensor:
+        raise TypeError(f"{type(self).__name__}: only pixels and rays of the plane move; got distances")
+
     def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> PixelPositions:
         if not self.antialias:
             return PixelPositions(*self._of_rows(rows), None)

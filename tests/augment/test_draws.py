@@ -78,3 +78,17 @@ def test_a_range_that_native_code_does_not_know_is_drawn(monkeypatch):
     lens = ct.Pinhole.from_fov(70, image_size=(48, 64)).requires_grad_(False)
     out = augmentation(image=torch.zeros(1, 48, 64), camera=lens)
     assert out["camera"].intrinsics[0] == 2 * lens.intrinsics[0]
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize(("name", "size"), [("distortion", 16), ("centre", 2), ("yaw", None)])
+def test_a_range_that_is_set_must_draw_as_many_numbers(name, size, count):
+    camera = ct.BrownConrady([40.0, 40.0, 31.5, 23.5], [-0.1, 0.02, 0.0, 0.0], image_size=(48, 64)).requires_grad_(False)
+    augment = ct.augment.RandomCamera(camera=camera)
+    images = torch.zeros(count, 3, 48, 64)
+    augment(image=images)
+    augment.ranges[name] = ct.augment.Range(-0.02, 0.02, 3 if size is None else None)
+    with pytest.raises(ValueError, match=r"Range\(low, high"):
+        augment(image=images)
+    augment.ranges[name] = ct.augment.Range(-0.02, 0.02, size)
+    augment(image=images)
