@@ -20,7 +20,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited, quarter_turns
 from camtorch.evaluate.tensors import known_false, known_true
 from camtorch.values.arguments import as_known_size, as_whole
-from camtorch.warp.affine import AffineWarp, Map, Rows, after, as_tensor
+from camtorch.warp.affine import AffineWarp, Map, Rows, after, map_as_tensor
 from camtorch.warp.options import Options
 
 Size = int | Sequence[int]
@@ -88,7 +88,7 @@ class Edit(Augmentation):
             return matrix, new
         if known_true(~applied):
             return None, new
-        matrix = as_tensor(matrix)
+        matrix = map_as_tensor(matrix)
         still = matrix.new_tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
         return torch.where(applied[:, None, None].to(matrix.device), matrix, still), new
 
@@ -106,8 +106,8 @@ def change_by(edits: Sequence[tuple[Edit, Draw]], camera: Camera, options: Optio
         if matrix is None:
             return Part(source)
         may_be_one = isinstance(matrix, Tensor) and matrix.ndim == 3 and not source.batch_shape
-        if may_be_one and known_true(as_tensor(matrix) == as_tensor(matrix)[:1]):
-            matrix = as_tensor(matrix)[0]  # one map serves the whole batch
+        if may_be_one and known_true(map_as_tensor(matrix) == map_as_tensor(matrix)[:1]):
+            matrix = map_as_tensor(matrix)[0]  # one map serves the whole batch
         warp = AffineWarp(source, edited(source, matrix, size), matrix, _turn(matrix, source), **options)
         return Part(source, warp)
 
@@ -118,7 +118,7 @@ def _turn(matrix: Map, source: Camera) -> Tensor | None:
     """Return the effect (*B, 3, 3) of an edit on rays; None if it leaves them unchanged."""
     if not isinstance(matrix, Tensor) and matrix[0][0] > 0 and matrix[1][1] > 0:
         return None
-    factors, like = as_tensor(matrix)[..., :2], source.intrinsics
+    factors, like = map_as_tensor(matrix)[..., :2], source.intrinsics
     if known_true(factors.diagonal(dim1=-2, dim2=-1) > 0):
         return None
     signs = factors.sign()  # of a mirror, or a turn about the axis

@@ -17,8 +17,8 @@ from camtorch.evaluate.tensors import known_some, known_true
 from camtorch.poses.rotations import are_rotations, check_rotation, is_right, rotation_matrix, rotation_vector
 from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians
 from camtorch.values.dtypes import widen
+from camtorch.warp.at_once import Label
 from camtorch.warp.options import Options, Sampler
-from camtorch.warp.samples import Label
 
 Named = dict[str, tuple[str, Any]]
 """Maps a name to (kind, tensor or list of tensors)."""

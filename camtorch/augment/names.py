@@ -18,7 +18,7 @@ ALIASES = {
     **{"images": "image", "masks": "mask", "bboxes": "boxes", "point": "points", "face_center": "points"},
     **{name: "K" for name in NAMES if name != "K"},
 }
-_PLACES = {
+_WORDS_OF_KINDS = {
     "roi": "boxes",
     **dict.fromkeys(("eye", "pupil", "nose", "mouth", "corner", "center", "centre"), "keypoints"),
 }
@@ -105,8 +105,8 @@ def is_text(value: Any) -> bool:
 def _close_to(name: str) -> list[str]:
     """Return the kind that a name may mean: of the whole, or of its last word, as in `face_bbox` and `left_eye`."""
     last = name.rpartition("_")[2].removesuffix("s")
-    if name.startswith("seg") or "box" in last or last in _PLACES:
-        return ["mask" if name.startswith("seg") else "boxes" if "box" in last else _PLACES[last]]
+    if name.startswith("seg") or "box" in last or last in _WORDS_OF_KINDS:
+        return ["mask" if name.startswith("seg") else "boxes" if "box" in last else _WORDS_OF_KINDS[last]]
     return difflib.get_close_matches(name, KINDS, 1) or difflib.get_close_matches(last, KINDS, 1)
 
 

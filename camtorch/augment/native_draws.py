@@ -33,7 +33,7 @@ from camtorch.values.module import model_of, remade
 from camtorch.warp.options import Options
 
 _SIZES = {"centre": 2, "distortion": structs.AMOUNTS, "place": 2}
-_KINDS = {
+_CODES = {
     "yaw": structs.YAW,
     "pitch": structs.PITCH,
     "roll": structs.ROLL,
@@ -74,7 +74,7 @@ class Start:
     def of(cls, wanted: Wanted) -> Start | None:
         """Return a `Start`; None if C lacks a range or a model, dtypes differ, or some numbers are no camera's."""
         source, base = wanted.source, wanted.base
-        if not wanted.names <= _KINDS.keys():
+        if not wanted.names <= _CODES.keys():
             return None
         of_source, of_base = (
             camera_rows(camera, *[t.expand(*camera.batch_shape, t.shape[-1]) for t in camera.tensors])
@@ -93,7 +93,7 @@ class Start:
         source, base, size = wanted.source, wanted.base, wanted.size
         self.base, self._source_native, self._base_native, self._size = base, source_native, base_native, size
         self._is_flat = source.turn_axis is None and base.turn_axis is None
-        self._names: list[str] = [name for name in _KINDS if name in wanted.names]
+        self._names: list[str] = [name for name in _CODES if name in wanted.names]
         self._batch = tuple(wanted.sized.shape[:-1]) or base.batch_shape  # (B,) if each camera has a lens of its own
         self._types = (c_float, np.float32) if base_native.dtype == torch.float32 else (c_double, np.float64)
         self._needs_limits = False  # whether new lenses of an earlier call needed limits on azimuths
@@ -106,7 +106,7 @@ class Start:
         call.first[:] = [-1] * structs.DRAWN_KINDS
         self._drawn = 0  # how many numbers are drawn for a camera
         for name in self._names:
-            call.first[_KINDS[name]] = self._drawn
+            call.first[_CODES[name]] = self._drawn
             self._drawn += _SIZES.get(name, 1)
         base_native.add_table()  # the table of the inverse, for cameras that unproject
         call.base, call.made, call.made.usable = base_native.pointer, base_native.struct, None

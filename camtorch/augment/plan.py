@@ -21,9 +21,9 @@ from camtorch.native.library import native_available
 from camtorch.native.structs import EDGE_POINTS
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import thread_count
+from camtorch.warp.at_once import Label, MovedField, SampleCall, call_for, natives_of
 from camtorch.warp.boxes import along_edges, around, corners_of, in_order
 from camtorch.warp.options import Options, Sampler
-from camtorch.warp.samples import Label, MovedField, SampleCall, call_for, natives_of
 
 _ALSO_MIRRORED: Sequence[Label] = "boxes", "rays"
 """Labels of a single sample that one call of C moves beside pixels, also in a mirror."""

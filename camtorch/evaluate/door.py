@@ -25,7 +25,7 @@ COLLATE_FUNCTIONS: dict[Any, Callable[..., Any]] = default_collate_fn_map
 collate_by: Callable[..., Any] = collate  # `default_collate` with other functions, `collate_fn_map`
 
 _DENSE = torch._C._dispatch_keys(torch.empty(0, device="cpu"))
-_PLAIN: int = _DENSE.raw_repr()
+_DENSE_KEYS: int = _DENSE.raw_repr()
 
 
 def has_tangent(tensor: Tensor) -> bool:
@@ -71,7 +71,7 @@ def in_memory(tensor: Tensor) -> bool:
     """
     keys = torch._C._dispatch_keys(tensor)
     mine: int = keys.raw_repr()
-    return mine == _PLAIN or (keys | _DENSE).raw_repr() == _PLAIN
+    return mine == _DENSE_KEYS or (keys | _DENSE).raw_repr() == _DENSE_KEYS
 
 
 def is_recorded() -> bool:
@@ -185,7 +185,7 @@ def is_eager(*tensors: Tensor) -> bool:
         return False
     keys_of = torch._C._dispatch_keys
     for tensor in tensors:  # noqa: SIM110 (a generator takes half as long again)
-        if keys_of(tensor).raw_repr() != _PLAIN and not in_memory(tensor):
+        if keys_of(tensor).raw_repr() != _DENSE_KEYS and not in_memory(tensor):
             return False
     return True
 

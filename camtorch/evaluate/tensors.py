@@ -89,17 +89,17 @@ def are_free(*tensors: Tensor) -> bool:
 
 def are_numbers(*tensors: Tensor) -> bool:
     """Whether nothing records operations on tensors, which are plain ones in the CPU's memory."""
-    return are_free(*tensors) and _PLAIN.issuperset(map(type, tensors))
+    return are_free(*tensors) and _TYPES.issuperset(map(type, tensors))
 
 
 def hold_numbers(tensors: Sequence[Tensor]) -> bool:
     """Whether `are_numbers`, in less time, if it is known that nothing is traced or transformed."""
-    if not (_PLAIN.issuperset(map(type, tensors)) and all(map(_is_cpu, tensors))):
+    if not (_TYPES.issuperset(map(type, tensors)) and all(map(_is_cpu, tensors))):
         return False
     return not (torch.is_grad_enabled() and any(map(_requires_grad, tensors)))
 
 
-_PLAIN = frozenset((Tensor, nn.Parameter))
+_TYPES = frozenset((Tensor, nn.Parameter))
 _is_cpu, _requires_grad = map(operator.attrgetter, ("is_cpu", "requires_grad"))  # without loops of Python
 
 

@@ -20,12 +20,12 @@ from camtorch.poses.rotations import transposed
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
+from camtorch.warp.camera_pair import Route
 from camtorch.warp.grid import coarse
 from camtorch.warp.lattice import PixelPositions, Positions, straight_lattice
 from camtorch.warp.moving import placed
 from camtorch.warp.options import Options, PaddingMode, Sampler
 from camtorch.warp.panorama import lengths
-from camtorch.warp.plan import Route
 from camtorch.warp.sampling import SHRINKS, render
 from camtorch.warp.warp import Warp
 
@@ -71,7 +71,7 @@ class UncheckedWarp(Warp):
         if called and self._ways_need_values(smooth) and not keeps_graph(images, *self.tensors):
             options = self.antialias, sampler.padding_mode, sampler
             cameras = self.source, self.target, self.rotation
-            matrix = None if self.map is None else as_tensor(self.map)
+            matrix = None if self.map is None else map_as_tensor(self.map)
             return compiled.warped(images, *cameras, self.tolerance, *options, matrix, _edited)
         route = route or self.route(images)
         ways = None if in_transform() else self._ways(sampler, smooth, route)
@@ -176,7 +176,7 @@ class AffineWarp(UncheckedWarp):
     def __init__(self, source: Camera, target: Camera, matrix: Map, rotation: Tensor | None, **options: Any):
         super().__init__(source, target, rotation, **options)
         self.map = matrix
-        given = as_tensor(matrix)
+        given = map_as_tensor(matrix)
         device = source.intrinsics.device
         dtype = torch.float32 if device.type in WITHOUT_FLOAT64 else given.dtype
         self.register_buffer("matrix", given.to(device, dtype), persistent=False)
@@ -324,7 +324,7 @@ def _edited(
     return (compiled.laid(warp(images), is_last),)
 
 
-def as_tensor(matrix: Map) -> Tensor:
+def map_as_tensor(matrix: Map) -> Tensor:
     """Return a map as a tensor (*B, 2, 3) in float64."""
     return matrix if isinstance(matrix, Tensor) else torch.tensor(matrix, dtype=torch.float64)
 
@@ -342,7 +342,7 @@ def inverted(matrix: Map) -> Any:
 def after(second: Map, first: Map) -> Map:
     """Return the maps (*B, 2, 3) that apply `first`, then `second`."""
     if isinstance(second, Tensor) or isinstance(first, Tensor):
-        second, first = as_tensor(second), as_tensor(first)
+        second, first = map_as_tensor(second), map_as_tensor(first)
         return second[..., :2] @ first + F.pad(second[..., 2:], (2, 0))
     (a, b, left), (c, d, top) = second
     (e, f, x), (g, h, y) = first

@@ -9,7 +9,7 @@ from camtorch.evaluate.devices import sent
 from camtorch.evaluate.tensors import is_predicted, known_true
 from camtorch.native.structs import EDGE_POINTS
 from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes
-from camtorch.warp.plan import CameraPair
+from camtorch.warp.camera_pair import CameraPair
 
 _ROUNDED_PIXELS = 1e-3  # from a panorama's edges, where rounding would cost rays
 _LATTICE_STEPS = 16  # across and down the target, between points that are tested against a polygon

@@ -76,7 +76,7 @@ class ShiftedWarp(Warp):
     def moved_distance(self, distance: Tensor) -> Tensor:
         """Return distances (B, 1, H, W) from the source as distances (B, 1, H', W') from the target, 0 for none."""
         seen, mapped = self._surface()
-        length = _between(distance[:, 0].expand(len(seen), -1, -1), seen.to(distance))
+        length = _distances_at(distance[:, 0].expand(len(seen), -1, -1), seen.to(distance))
         rays = self.source.unproject(seen)[0].to(distance)
         away = _length(rays * length[..., None] - self.shift.to(distance)[:, None, None])
         return torch.where(mapped & (length > 0), away, 0.0)[:, None]
@@ -95,7 +95,7 @@ class ShiftedWarp(Warp):
             found = seen.flatten(1, 2).gather(1, index[..., None].expand(-1, -1, 2)).view(pixels.shape)
             return found, mapped.flatten(1).gather(1, index).view(at.shape)
         rays, has_ray = self.source.unproject(pixels)
-        length = _between(self.distance.to(rays), pixels.detach())
+        length = _distances_at(self.distance.to(rays), pixels.detach())
         moved, mapped = self.target.project(self.transform_positions(rays * length[..., None]))
         return placed(self.target, moved, has_ray & mapped & (length > 0), on_image)
 
@@ -125,7 +125,7 @@ class ShiftedWarp(Warp):
         for _ in range(_STEPS):
             at = self.shift[i] + far[:, None] * along
             pixels, mapped = source.project(at)
-            there = _between(self.distance[i : i + 1], pixels[None])[0]
+            there = _distances_at(self.distance[i : i + 1], pixels[None])[0]
             off = there - _length(at)
             met = mapped & (there > 0) & (off.abs() < _MEETING_DISTANCE * there)
             seen[left], good[left] = pixels, met
@@ -157,7 +157,7 @@ class ShiftedWarp(Warp):
         return torch.where(found < 1e30, found, 0.0)
 
 
-def _between(distance: Tensor, pixels: Tensor) -> Tensor:
+def _distances_at(distance: Tensor, pixels: Tensor) -> Tensor:
     """Return distances (B, *N) at pixels of maps (B, H, W), 0 if unknown: linear, or the nearest between surfaces."""
     (height, width), dtype = distance.shape[1:], torch.promote_types(distance.dtype, pixels.dtype)
     u, v = pixels.to(dtype).reshape(len(distance), pixels.shape[1:-1].numel(), 2).unbind(-1)

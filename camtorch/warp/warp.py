@@ -27,8 +27,8 @@ from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import typed_as
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
+from camtorch.warp.camera_pair import CameraPair, KeptPositions
 from camtorch.warp.options import MODES, PADDINGS, Fill, Mode, Options, PaddingMode, Sampler, as_fill, as_options
-from camtorch.warp.plan import CameraPair, KeptPositions
 
 
 def as_sized(camera: Camera, name: str, owner: str) -> Camera:
@@ -149,10 +149,12 @@ class Warp(CameraPair):
             TypeError: If images are none of these kinds, or complex.
         """
         call: Any = self.ready(images, mode, padding_mode) if fill is None else None
-        made: Any = self._alike(images, mode, padding_mode, fill) if call is None else call(images)
+        made: Any = self._without_kept_call(images, mode, padding_mode, fill) if call is None else call(images)
         return made  # type: ignore[no-any-return]  # of the kind of the images
 
-    def _alike(self, images: Any, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None) -> Any:
+    def _without_kept_call(
+        self, images: Any, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None
+    ) -> Any:
         """Return the result of `forward` for images that no kept call fits."""
         if not isinstance(images, Tensor):
             warp = partial(self.forward, mode=mode, padding_mode=padding_mode, fill=fill)

@@ -83,7 +83,9 @@ def test_a_range_that_native_code_does_not_know_is_drawn(monkeypatch):
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize(("name", "size"), [("distortion", 16), ("centre", 2), ("yaw", None)])
 def test_a_range_that_is_set_must_draw_as_many_numbers(name, size, count):
-    camera = ct.BrownConrady([40.0, 40.0, 31.5, 23.5], [-0.1, 0.02, 0.0, 0.0], image_size=(48, 64)).requires_grad_(False)
+    camera = ct.BrownConrady([40.0, 40.0, 31.5, 23.5], [-0.1, 0.02, 0.0, 0.0], image_size=(48, 64)).requires_grad_(
+        False
+    )
     augment = ct.augment.RandomCamera(camera=camera)
     images = torch.zeros(count, 3, 48, 64)
     augment(image=images)

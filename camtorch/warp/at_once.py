@@ -20,10 +20,10 @@ from camtorch.projection.evaluation import native_forms
 from camtorch.projection.native_calls import Lattices, NativeMove, run_and_follow
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
+from camtorch.warp.camera_pair import CameraPair
 from camtorch.warp.grid import FEWEST_CELLS, MOST_KEPT_NODES, coarse, probes
 from camtorch.warp.options import Options, Sampler, serving_all
 from camtorch.warp.panorama import goes_round
-from camtorch.warp.plan import CameraPair
 from camtorch.warp.sampling import SHRINKS, SURELY
 
 Label = Literal["pixels", "boxes", "rays", "columns", "pose", "rotation vectors"]
