@@ -155,6 +155,16 @@ class Augmentation(SampleTransform):
             for name, value in numbers.items()
         }
 
+    # Kinds of camtorch override these, besides `new_camera`, in the order in which a call asks them:
+    # _draw_numbers   Compose, of all parts
+    # _with_labels    RandomMount, for the depths of a shift; boxes of `crops` for all
+    # _checked_draw   RandomMount, of a draw that was given
+    # _change         Compose, step by step; Edit, by a matrix
+    # _part           lenses and mounts, by C; RandomMount with a shift; RandomShutter
+    # _new_camera     lenses and mounts, whose formulas take float64
+    # _part_between   lenses and mounts, with colours and light
+    # and, without a draw: size_after, tell_of_empty_images, _chain_error
+
     def _draw_numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> Draw:
         """Return a draw as lists, arrays or tensors; see `ranges.py`."""
         return draw_numbers(self.ranges, count, p, same_on_batch, generator)
@@ -191,7 +201,7 @@ class Augmentation(SampleTransform):
         if before is None or isinstance(before, (int, float)):
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
             raise ValueError(f"{self._name}: camera must be given; got {before}. Please {how}. {GUESS_CAMERA}")
-        return self._change_on_host(one_or_batch(before), self._as_numbers(draw))
+        return self._change_on_host(one_or_batch(before), self._checked_draw(draw))
 
     def _change_on_host(self, camera: Camera, draw: Draw) -> Change:
         """Return the change of a draw, computed on the CPU also for fixed cameras elsewhere, if the draw is there."""
@@ -250,7 +260,7 @@ class Augmentation(SampleTransform):
             return f"be edits after {' and '.join(sorted(colours))}, which another lens would show"
         return None
 
-    def _as_numbers(self, draw: Mapping[str, Tensor]) -> Draw:
+    def _checked_draw(self, draw: Mapping[str, Tensor]) -> Draw:
         """Check a draw that is given, and return it as arrays, or as tensors if numbers may not be read."""
         as_mapping(draw, "draw", self._name, "what draw() returns")
         sizes = {**{name: interval.size for name, interval in self.ranges.items()}, **dict.fromkeys(self.crops, 4)}

@@ -47,7 +47,6 @@ class LazyWarp:
 
     # what changes ask of a `Warp`, too
     joins_earlier: ClassVar[bool] = False
-    may_mirror: ClassVar[bool] = True
     moves_by_cameras: ClassVar[bool] = True
     like: Camera  # the new cameras are of its model
     intrinsics: np.ndarray[Any, Any]  # (4,) of one, or (B, 4)
@@ -59,7 +58,7 @@ class LazyWarp:
     target_native: Native | None  # the new cameras, for native code; None if it does not have them
     zooms: Sequence[float] = ()  # (B,): the factors on focal lengths that `min_filled` asks for; empty if it does not
     filled: Sequence[float] = ()  # (B,): the part of each image that is filled then
-    is_turn: bool = True  # of a single rotation: whether it is no mirror
+    may_mirror: bool = False  # whether the rotation may be a mirror, as after a flip
     _warp: Warp | None = field(default=None, init=False)  # `warp()`, once it was called
     _target: Camera | None = field(default=None, init=False)  # `target`, once it was read
 
@@ -174,8 +173,8 @@ class Part:
             )
         if isinstance(last, LazyWarp) and not self.camera.batch_shape:
             native = first.source_native if isinstance(first, LazyWarp) else _single(self.camera)
-            is_turn = rotation is None or (rotation.ndim == 2 and is_right(rotation))
-            moves = replace(last, rotation=rotation, source_native=native, is_turn=is_turn)
+            may_mirror = rotation is not None and (rotation.ndim > 2 or not is_right(rotation))
+            moves = replace(last, rotation=rotation, source_native=native, may_mirror=may_mirror)
             return replace(second, camera=self.camera, moves=moves)
         moved = second.with_warps(lambda warp: UncheckedWarp(self.camera, warp.target, rotation))
         return replace(moved, camera=self.camera)

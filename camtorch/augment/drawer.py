@@ -122,7 +122,7 @@ class CameraDrawer(Augmentation):
             check_degrees(self.ranges["fov"].low, fov, self._name)
         real = self.ranges.pop("fov", None) if self._is_real else None
         self._among = None if real is None else (real.low, real.high)  # as states of 0.4 name the fov of real lenses
-        self.like = None if self._is_real else like
+        self.like = None if self._is_real else like  # last, as setting it reads `fov` and `ranges`
 
     @property
     def makes_pinholes(self) -> bool:  # type: ignore[override]

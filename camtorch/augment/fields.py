@@ -284,6 +284,7 @@ _POSE = Field(
     hint=_pose_hint,
     check=_check_pose,
 )
+# the order counts where several kinds would do: whether a sample is a batch, and what a wrong name may have meant
 KINDS = {
     "image": Field(
         dims=3,
@@ -355,7 +356,7 @@ KINDS = {
         most_dims=3,
         ends=[(2,), (3,)],
         shape="(B, N, 2) pixels or (B, N, 3) points of the camera frame",
-        move=_by(Change.points),  # never called: `field_of` gives the row of keypoints or of points
+        move=lambda change, value, options: field_of("landmarks", value).move(change, value, options),
         tells_batches=True,
         in_pixels=True,
         hint=_landmarks_hint,

@@ -25,10 +25,10 @@ from camtorch.warp.at_once import Label, MovedField, SampleCall, call_for, nativ
 from camtorch.warp.boxes import along_edges, around, corners_of, in_order
 from camtorch.warp.options import Options, Sampler
 
-_ALSO_MIRRORED: Sequence[Label] = "boxes", "rays"
-"""Labels of a single sample that one call of C moves beside pixels, also in a mirror."""
-_NOT_MIRRORED: Sequence[Label] = *_ALSO_MIRRORED, "columns", "pose", "rotation vectors"
-"""Those that it moves where nothing is mirrored."""
+_LABELS_OF_MIRRORS: Sequence[Label] = "boxes", "rays"
+"""Labels of a single sample that one call of C moves beside pixels where it is mirrored."""
+_LABELS_OF_TURNS: Sequence[Label] = *_LABELS_OF_MIRRORS, "columns", "pose", "rotation vectors"
+"""Labels that it moves where nothing is mirrored."""
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
 
 
@@ -97,7 +97,7 @@ class SamplePlan:
         if isinstance(moves, LazyWarp):
             source, target, rotation, size = moves.source_native, moves.target_native, moves.rotation, moves.image_size
             if self.count == 1:
-                labels = _NOT_MIRRORED if moves.is_turn else _ALSO_MIRRORED
+                labels = _LABELS_OF_MIRRORS if moves.may_mirror else _LABELS_OF_TURNS
         elif part.shades or part.light is not None or (natives := natives_of(moves)) is None:
             return {}
         else:
@@ -136,21 +136,31 @@ class SamplePlan:
         hows: dict[str, Sampler | Label] = {}
         for name, kind in self.fields.items():
             value = values[name]
-            if isinstance(value, list) or (how := field_of(kind, value).by_c) == "never":
+            if isinstance(value, list) or field_of(kind, value).by_c == "never":
                 return [], None
-            if how is None or value.ndim - self.batched > KINDS[kind].most_dims:  # frames move by `move`
-                continue
-            if callable(how):
-                sampler = how(options, self.mask_fill)
-                hows |= {name: sampler} if len(sampler.fill) == 1 or len(sampler.fill) == value.shape[-3] else {}
-            elif how == "pixels":
-                hows |= {name: how} if self.count == 1 or value.numel() < _MANY_PIXELS else {}
-            elif how in labels and value.dtype == dtype and are_numbers(value):
-                hows |= {name: how} if how == "boxes" or value.is_contiguous() else {}
+            if (how := self._how_of(kind, value, dtype, options, labels)) is not None:
+                hows[name] = how
         if not hows:
             return [], None
         sizes, chosen = (camera.size_for("Warp"), size), [values[name] for name in hows]
         return [*hows], call_for(sizes, dtype, options, chosen, [*hows.values()], self.batched)
+
+    def _how_of(
+        self, kind: str, value: Tensor, dtype: torch.dtype, options: Options, labels: Sequence[Label]
+    ) -> Sampler | Label | None:
+        """Return how one call of C moves a value, see `_new_call`; None if it does not."""
+        how: Any = field_of(kind, value).by_c
+        if how is None or value.ndim - self.batched > KINDS[kind].most_dims:  # frames move by `move`
+            return None
+        if callable(how):
+            sampler: Sampler = how(options, self.mask_fill)
+            return sampler if len(sampler.fill) == 1 or len(sampler.fill) == value.shape[-3] else None
+        label: Label = how
+        if label == "pixels":
+            return label if self.count == 1 or value.numel() < _MANY_PIXELS else None
+        if label not in labels or value.dtype != dtype or not are_numbers(value):
+            return None
+        return label if label == "boxes" or value.is_contiguous() else None
 
     def _pixels_at_once(self, part: Part, values: Mapping[str, Any]) -> dict[str, MovedField]:
         """Move all pixels and boxes by one evaluation of the cameras: in torch each takes hundreds of operations."""
@@ -212,7 +222,7 @@ def move(change: Change, kind: str, value: Tensor, options: Mapping[str, float])
         return result.reshape(1, *lead, *result.shape[1:]), valid if valid is None else valid.reshape(
             1, *lead, *valid.shape[1:]
         )
-    result = field_of(kind, value).move(change, value, options)
+    result = KINDS[kind].move(change, value, options)
     result, valid = result if isinstance(result, tuple) else (result, None)
     # geometry is computed in float32 at least; what came in half precision goes out in it
     return _in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid

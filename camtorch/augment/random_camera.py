@@ -156,8 +156,8 @@ class RandomMount(CameraDrawer):
             f"against far ones; got {', '.join(named)}. Without shift, yaw, pitch, roll and zoom are exact"
         )
 
-    def _as_numbers(self, draw: Mapping[str, Tensor]) -> Draw:
-        return {**super()._as_numbers(draw), **{key: draw[key] for key in _DEPTHS if key in draw}}
+    def _checked_draw(self, draw: Mapping[str, Tensor]) -> Draw:
+        return {**super()._checked_draw(draw), **{key: draw[key] for key in _DEPTHS if key in draw}}
 
     def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
         if _SHIFTS[0] in self.ranges:

@@ -317,6 +317,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             check_targets(plan.fields, change, self._name)
         moved = dict(sample)
         options = {"mask_fill": self.mask_fill, "lateral": mirroring.lateral if mirroring else 0}
+        # `image_valid` asks for the position of each pixel, which the call of C would compute once more
         together = {} if "image_valid" in plan.masks else plan.together(change, batch.values)
         for name in plan.fields:
             value, valid = together[name] if name in together else batch.moved(name, change, options, self._name)
