@@ -326,6 +326,20 @@ def test_chromatic_aberration_scales_red_and_blue():
     torch.testing.assert_close(grey, out["image"][:, 1:2])
 
 
+@pytest.mark.parametrize("own", [0.0, (0.1, 0.2, 0.3)])
+def test_a_given_fill_counts_for_each_colour(own):
+    camera, images = pinhole(SIZE, 250.0), torch.rand(2, 3, *SIZE)
+    still = {"camera": camera, "zoom": (0.5, 0.5), "min_filled": 0, "fill": own}
+    shifted = RandomMount(chromatic=(0.01, 0.01), **still)
+    shifted(image=images)
+    for fill in (0.5, [0.5], (0.4, 0.5, 0.6), torch.tensor([0.4, 0.5, 0.6])):
+        corner = shifted.last.images(images, fill=fill)[:, :, 0, 0]
+        assert torch.equal(corner, torch.as_tensor(fill).expand(2, 3)), fill
+    assert torch.equal(shifted.last.images(images)[:, :, 0, 0], torch.as_tensor(own).expand(2, 3))
+    with pytest.raises(ValueError, match="fill must have 1 value or 3, one for each channel; got 2"):
+        shifted.last.images(images, fill=(0.4, 0.5))
+
+
 def test_empty_batches():
     empty = {k: v[:0] if isinstance(v, torch.Tensor) else v for k, v in sample().items()}
     makers = [lambda make=make: make(image_size=(30, 40)) for name, make in AUGMENTATIONS.items() if name != "chain"]
