@@ -18,7 +18,7 @@ from camtorch.augment.landmarks import Mirroring, TableLike
 from camtorch.augment.ranges import Draw, Range, as_range, rows_of
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited, quarter_turns
-from camtorch.evaluate.tensors import known_false, known_true
+from camtorch.evaluate.tensors import known_false, known_some, known_true
 from camtorch.values.arguments import as_known_size, as_whole
 from camtorch.warp.affine import AffineWarp, Map, Rows, after, map_as_tensor
 from camtorch.warp.options import Options
@@ -76,6 +76,8 @@ class Edit(Augmentation):
     def map_of(self, draw: Draw, size: tuple[int, int]) -> tuple[Map | None, tuple[int, int]]:
         """Return the map of a draw for images of a size (None if it never applies), and the new size."""
         applied = torch.as_tensor(draw["apply"])
+        if self.p == 0 and not known_some(applied):  # as `p` says, where values may not be read
+            return None, size
         values = {n: torch.as_tensor(value, dtype=torch.float64) for n, value in draw.items() if n != "apply"}
         matrix, new = self.edit(size, values)
         all_are = known_true(applied) or (self.p == 1 and not known_false(applied))

@@ -362,6 +362,8 @@ def test_rows_that_nothing_applies_to_stay():
     assert torch.equal(out["image"][still], image[still])
     never = A.Compose([A.HorizontalFlip(p=1.0)], p=0.0)
     assert torch.equal(never(image=image)["image"], image)
+    for skipped in (A.Resize(20, p=0), A.RandomResizedCrop(20, p=0), A.Compose([A.Resize(20, p=0)])):
+        assert torch.equal(skipped(image=image)["image"], image)
     whole = A.Compose([A.HorizontalFlip(p=1.0)], same_on_batch=True, p=0.5)
     flipped = {tuple(whole(image=image)["rotation"][:, 0, 0].unique().tolist()) for _ in range(20)}
     assert flipped == {(1.0,), (-1.0,)}
