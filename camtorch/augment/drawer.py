@@ -166,7 +166,8 @@ class CameraDrawer(Augmentation):
         """Return the new camera and its turn, by formulas of torch; see `Augmentation.new_camera`."""
         base, sized, covered_radius = self._lens_for(source, values.get("lens"))
         height, width = size = self._size_of(source)
-        fx, fy, cx, cy = (_as_wide(base, sized, values["fov"], width) if "fov" in values else sized).unbind(-1)
+        wide = _as_wide(base, sized, values["fov"], width, self._name) if "fov" in values else sized
+        fx, fy, cx, cy = wide.unbind(-1)
         for name in ("focal", "zoom"):
             if name in values:
                 fx, fy = fx * values[name], fy * values[name]
@@ -246,7 +247,7 @@ class CameraDrawer(Augmentation):
         base, sized, covered_radius = self._lens_for(source.detach().clone(), values.get("lens"))
         jitters, size = "distortion" in values and base.distortion.shape[-1] > 0, self._size_of(source)
         nominal = self._nominal(base, sized, size, values) if jitters else None
-        return Start.of(Wanted(source, base, sized, covered_radius, size, names, nominal, self.min_filled))
+        return Start.of(Wanted(source, base, sized, covered_radius, size, names, nominal, self.min_filled, self._name))
 
     def _part_between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
         """Return the part with the effect of the lens on colours and light."""
@@ -295,7 +296,7 @@ class CameraDrawer(Augmentation):
 
         def made() -> Tensor:
             middle = precise(base.intrinsics).new_tensor(self.ranges["fov"].middle)
-            return _as_wide(base, sized, middle, size[1]).detach().to(base.intrinsics.dtype)
+            return _as_wide(base, sized, middle, size[1], self._name).detach().to(base.intrinsics.dtype)
 
         return self._memo(base.tensors, ("nominal", type(base), base.image_size, size, self.ranges["fov"]), made)
 
@@ -305,7 +306,7 @@ class CameraDrawer(Augmentation):
         def narrowed() -> Tensor:
             sized = _sized(base, size)
             if base.image_size is None:
-                sized = _as_wide(base, sized, torch.rad2deg(field_of_view(source)[..., 0]), size[1])
+                sized = _as_wide(base, sized, torch.rad2deg(field_of_view(source)[..., 0]), size[1], self._name)
             whole = remade(base, intrinsics=sized.to(base.intrinsics.dtype), image_size=size)
             return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
 
@@ -337,7 +338,7 @@ def _sized(base: Camera, size: tuple[int, int]) -> Tensor:
     return torch.stack((fx, fy, cx, cy), -1)
 
 
-def _as_wide(base: Camera, sized: Tensor, fov: Tensor, width: int) -> Tensor:
+def _as_wide(base: Camera, sized: Tensor, fov: Tensor, width: int, owner: str) -> Tensor:
     """Return intrinsics (*B, 4) with the focal lengths by which the lens is as wide as a `fov` (*B,) in degrees."""
     half = fov * (math.pi / 360)
     sine, cosine = half.sin(), half.cos()
@@ -347,7 +348,8 @@ def _as_wide(base: Camera, sized: Tensor, fov: Tensor, width: int) -> Tensor:
     pixels, valid = base.project(rays)
     if known_false(valid):
         raise ValueError(
-            f"fov must be within the reach of a {base.key} lens of these coefficients; got {float(fov.max()):g} degrees"
+            f"{owner}: fov must be within the reach of a {base.key} lens of these coefficients; got "
+            f"{float(fov.max()):g} degrees"
         )
     ratio = width / (pixels[..., 1, 0] - pixels[..., 0, 0])
     focal = precise(base.intrinsics)[..., :2] * ratio.unsqueeze(-1)

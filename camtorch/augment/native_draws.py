@@ -65,6 +65,7 @@ class Wanted(NamedTuple):
     names: Set[str]  # of the values that are drawn
     nominal: Tensor | None  # intrinsics (*B, 4) of the lens by which coefficients are measured, if they are jittered
     share: float | None  # of each image that has to be filled, if any has to
+    owner: str  # the augmentation's name, for errors
 
 
 class Start:
@@ -92,6 +93,7 @@ class Start:
         """Start from the source and the base as native code takes them: `source_native` and `base_native`."""
         source, base, size = wanted.source, wanted.base, wanted.size
         self.base, self._source_native, self._base_native, self._size = base, source_native, base_native, size
+        self._owner = wanted.owner
         self._is_flat = source.turn_axis is None and base.turn_axis is None
         self._names: list[str] = [name for name in _CODES if name in wanted.names]
         self._batch = tuple(wanted.sized.shape[:-1]) or base.batch_shape  # (B,) if each camera has a lens of its own
@@ -206,15 +208,15 @@ class Start:
         if count != self._drawn * rows:
             sizes = ", ".join(f"{name} as Range(low, high, {size})" for name, size in _SIZES.items())
             raise ValueError(
-                f"ranges must draw {self._drawn} numbers for a sample, {sizes}, and others as Range(low, high); got "
-                f"{count} for {rows} samples"
+                f"{self._owner}: ranges must draw {self._drawn} numbers for a sample, {sizes}, and others as "
+                f"Range(low, high); got {count} for {rows} samples"
             )
 
     def _complete(self, left: int, values: Mapping[str, Any], call: structs.Draws, candidates: Native | None) -> None:
         """Compute the limits and ends that C lacked, of new lenses and of the cameras that it starts from."""
         if left & structs.TOO_WIDE:
             raise ValueError(
-                f"fov must be within the reach of a {self.base.key} lens of these coefficients; got "
+                f"{self._owner}: fov must be within the reach of a {self.base.key} lens of these coefficients; got "
                 f"{np.max(values['fov']):g} degrees"
             )
         if left & structs.LEFT_LENS and candidates is not None:

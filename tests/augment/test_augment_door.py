@@ -81,9 +81,8 @@ def test_cameras_and_draws(camera):
     samples, turned = ([aug(given) for _ in range(2)] for aug in (zooming, mount))
     zooming.inverse(samples[1])
     mount.inverse(turned[1])
-    some, wide = {"apply": torch.tensor([True, False])}, RandomLens("pinhole", fov=190)
+    some = {"apply": torch.tensor([True, False])}
     for call, text in (
-        (lambda: wide(given), "fov must be within the reach of a pinhole lens of these coefficients; got 190 degrees"),
         (lambda: mount(given | {"camera": ct.Pinhole([1.0, 1, 0, 0])}), "camera must have an image_size"),
         (lambda: mount(given | {"camera": {}}), "camera must be a Camera; got dict"),
         (lambda: mount(given | {"camera": camera.expand(3)}), r"no batch dims, or those of 2 samples; got \(3,\)"),
@@ -106,6 +105,15 @@ def test_cameras_and_draws(camera):
     ):
         with pytest.raises((TypeError, ValueError), match=text):
             call()
+
+
+@pytest.mark.parametrize("learns", [False, True], ids=["by C", "by torch"])
+def test_a_lens_that_cannot_be_so_wide_is_told_of_alike(camera, learns):
+    wide = RandomLens("pinhole", fov=190, camera=camera.clone().requires_grad_(learns))
+    text = "RandomLens: fov must be within the reach of a pinhole lens of these coefficients; got 190 degrees"
+    for images in (torch.zeros(3, *SIZE), torch.zeros(2, 3, *SIZE)):
+        with pytest.raises(ValueError, match=f"^{text}$"):
+            wide(image=images)
 
 
 def test_labels_that_are_no_numbers_are_invalid_and_finite(camera):
