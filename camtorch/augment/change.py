@@ -382,10 +382,12 @@ class Change:
         return Change(count, parts, mixed=self.mixed, gate=gate)
 
     def row(self, i: int) -> Change:
-        """Return the change of one sample."""
+        """Return the change of one sample; -1 is the last one, as in a list."""
+        row = i if i >= 0 else i + self.count
         for part in self.parts:
-            if part.rows is None or i in part.rows:
-                return self._with_parts([part.take([i if part.rows is None else part.rows.index(i)])], [i])
+            rows = range(self.count) if part.rows is None else part.rows
+            if row in rows:
+                return self._with_parts([part.take([rows.index(row)])], [row])
         raise IndexError(f"Change: row must be one of {self.count} samples; got {i}")
 
     def inverse(self) -> Change:

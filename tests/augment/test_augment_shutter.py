@@ -1,6 +1,7 @@
 """Augmentations whose camera turns while it takes its image, and whose lens darkens the rim."""
 
 import copy
+import itertools
 from functools import partial
 
 import pytest
@@ -51,6 +52,10 @@ def test_some_of_a_batch_and_cameras_of_several_models():
         assert torch.allclose(alone["image"][0], sample["image"][i], atol=1e-6)
     points = torch.full((3, 4, 2), 50.0)
     assert torch.equal(change.row(1).points(points[:1])[0], change.points(points)[0][1:2])
+    assert torch.equal(change.row(-1).points(points[:1])[0], change.points(points)[0][2:])
+    for of, outside in itertools.product((change, change.row(0)), (99, 3, -4)):
+        with pytest.raises(IndexError, match=f"Change: row must be one of {of.count} samples; got {outside}"):
+            of.row(outside)
 
 
 def test_a_chain_moves_images_once_and_ends_with_its_shutter():
