@@ -109,11 +109,11 @@ def test_cameras_and_draws(camera):
 
 @pytest.mark.parametrize("learns", [False, True], ids=["by C", "by torch"])
 def test_a_lens_that_cannot_be_so_wide_is_told_of_alike(camera, learns):
-    wide = RandomLens("pinhole", fov=190, camera=camera.clone().requires_grad_(learns))
+    wide, source = RandomLens("pinhole", fov=190), camera.clone().requires_grad_(learns)
     text = "RandomLens: fov must be within the reach of a pinhole lens of these coefficients; got 190 degrees"
     for images in (torch.zeros(3, *SIZE), torch.zeros(2, 3, *SIZE)):
         with pytest.raises(ValueError, match=f"^{text}$"):
-            wide(image=images)
+            wide(image=images, camera=source)
 
 
 def test_labels_that_are_no_numbers_are_invalid_and_finite(camera):
