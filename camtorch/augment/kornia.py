@@ -199,7 +199,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
         return result, valid.reshape(input.shape[: 2 - dims])
 
     def apply_transform(self, input: Tensor, params: Params, flags: Flags, transform: Any = None) -> Tensor:
-        options = {"mode": Resample.get(flags["resample"]).name.lower()}
+        options: Any = {"mode": Resample.get(flags["resample"]).name.lower()}
         options["padding_mode"] = SamplePadding.get(flags["padding_mode"]).name.lower()
         return self._move(input, params, flags, lambda change, images: change.images(images, **options))[0]
 
