@@ -23,7 +23,7 @@ from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import remade
 from camtorch.warp.affine import AffineWarp, UncheckedWarp, after, made_like
 from camtorch.warp.boxes import corners_of, in_order
-from camtorch.warp.options import Fill, Mode, Options, as_fill
+from camtorch.warp.options import Mode, Options, as_fill
 from camtorch.warp.panorama import seam_of
 from camtorch.warp.warp import Warp
 
@@ -421,19 +421,19 @@ class Change:
             moved = _both(lambda pair: gated(gate, *pair), moved, stay(self.parts[0].camera, value))
         return moved
 
-    def images(self, images: Tensor, *, fill: Fill | None = None, **options: Any) -> Tensor:
+    def images(self, images: Tensor, **options: Any) -> Tensor:
         """Move images (count, C, H, W), with the colours and the light of the lens; options as of `Warp.forward`."""
 
         def move(part: Part, rows: Tensor) -> Tensor:
-            warp = part.warp
+            warp, fill = part.warp, options.get("fill")
             values = warp.fill if fill is None or part.shades is None else as_fill(fill, "Warp")
             if part.shades is not None and rows.shape[1] == 3 and len(values) in (1, 3):  # `forward` refuses others
                 red, blue = part.shades
                 fills = values if len(values) == 3 else [fill] * 3
                 colours = enumerate(zip((red, warp, blue), fills, strict=True))
-                moved = torch.cat([w.pin()(rows[:, i : i + 1], fill=one, **options) for i, (w, one) in colours], 1)
+                moved = torch.cat([w.pin()(rows[:, i : i + 1], **{**options, "fill": f}) for i, (w, f) in colours], 1)
             else:
-                moved = warp.pin().forward(rows, fill=fill, **options)
+                moved = warp.pin().forward(rows, **options)
             return moved if part.light is None else narrow(widen(moved) * part.light.to(moved.device), rows.dtype)
 
         return self.each(images, move)
