@@ -84,7 +84,7 @@ class Transform(FrontEnd, v2.Transform):
         valid: whether points and boxes in dicts get flags.
 
     Raises:
-        TypeError: If `augmentation` is no Augmentation, or labels are lists of plain numbers.
+        TypeError: If `augmentation` is no Augmentation, a call gets no sample, or labels are lists of plain numbers.
         ValueError: If there is no camera, or one with batch dims; if images, boxes or points are not of the camera's
             image_size; if numbers under an unknown name might be geometry; if a PIL image holds no colours.
     """
@@ -100,6 +100,11 @@ class Transform(FrontEnd, v2.Transform):
 
     @on_samples
     def forward(self, *inputs: Any) -> Any:
+        if not inputs:
+            raise TypeError(
+                f"{_OWNER}: a sample must be given, as in transform(image, target) or transform({{'image': image}}); "
+                "got nothing"
+            )
         sample, kinds, write = self._read(inputs if len(inputs) > 1 else inputs[0])
         return write(*self.augmentation._augmented(sample, kinds))
 
