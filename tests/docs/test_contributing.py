@@ -171,6 +171,14 @@ def test_every_room_has_its_row():
     assert sorted(itertools.chain(*rooms())) == sorted(there)
 
 
+def test_every_folder_of_tests_has_the_name_of_a_room_or_a_row():
+    text = (ROOT / "CONTRIBUTING.md").read_text().split("## The tests")[1].split("\n## ")[0]
+    told = {*itertools.chain(*rooms()), *re.findall(r"`(\w+)/", "\n".join(re.findall(r"^\| (`.*?) \|", text, re.M)))}
+    folders = {path.parent.name for path in (ROOT / "tests").glob("*/test_*.py")}
+    assert len(folders) > 10
+    assert folders <= told, folders - told
+
+
 def test_imports_go_down_the_table():
     place = {name: i for i, row in enumerate(rooms()) for name in row}
     assert len(arrows()) > 100
