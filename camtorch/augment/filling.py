@@ -25,7 +25,7 @@ _LEAST_FOV_SHARE = 0.9  # of the least field of view that was asked for: below t
 
 
 def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
-    """Return the part (*B,) of the target's image that shows the source's image; 1 if its whole rim does."""
+    """Return the part (*B,) of the target's image that shows the source's; 1 only if its whole rim shows it too."""
     return _part_shown(source, target, _points(target), rotation)
 
 

@@ -27,6 +27,6 @@ class FrontEnd(KeepsCamera):
 
 
 def check_front_end(owner: str, augmentation: object, *kinds: type[SampleTransform]) -> None:
-    """Raise a TypeError if `augmentation` is none, nor of other `kinds`."""
+    """Raise a TypeError unless `augmentation` is of one of the `kinds`; without any, an `Augmentation`."""
     if not isinstance(augmentation, kinds or Augmentation):
         raise TypeError(f"{owner}: augmentation must be an Augmentation; got {type(augmentation).__name__}")

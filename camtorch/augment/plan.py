@@ -80,10 +80,11 @@ class SamplePlan:
         return value if self.batched or isinstance(value, list) else value.unsqueeze(0)
 
     def together(self, change: Change, values: Mapping[str, Any]) -> dict[str, MovedField]:
-        """Move by one call of C: images, pixels, and for a single sample boxes and rays.
+        """Move by one call of C: images, pixels, and of a single sample whose camera C drew also boxes and rays.
 
-        Without the library, pixels and boxes move by one evaluation in torch. The other fields, and all of them if no
-        call serves, are not in the result.
+        A `LazyWarp` goes to such a camera; other warps move images and pixels alone. Without the library, pixels and
+        boxes move by one evaluation in torch. The other fields, and all of them if no call serves, are not in the
+        result.
         """
         part, calls = change.parts[0], self.calls
         moves = part.moves
