@@ -48,7 +48,10 @@ def may_branch_on(values: Tensor, *others: Tensor) -> bool:
 
 
 def is_unknown(tensor: Tensor) -> bool:
-    """Whether values may not be read: they are traced, or within a transform, whose derivatives go forward."""
+    """Whether values cannot be read, as they are traced, or any transform of torch.func is active, also grad and vmap.
+
+    A dual tensor of `torch.autograd.forward_ad` is not unknown.
+    """
     return in_transform() or not is_concrete(tensor)
 
 
