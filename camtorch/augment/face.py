@@ -137,16 +137,16 @@ class FaceNormalizer(SampleTransform):
         camera = batch.camera
         if not isinstance(sample.get("camera", camera), (Camera, Guess)):
             raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(sample['camera'])}")
-        kinds = {name: value for name, (_, value) in batch.rows().items()}
-        if listed := [n for n in ("head_pose", "rvec", "tvec", "face_center") if isinstance(kinds.get(n), list)]:
+        values = {name: value for name, (_, value) in batch.rows().items()}
+        if listed := [n for n in ("head_pose", "rvec", "tvec", "face_center") if isinstance(values.get(n), list)]:
             raise TypeError(f"{self._name}: {', '.join(listed)} must be one tensor for all samples; got a list")
-        if "head_pose" in kinds:
-            head, centre = kinds["head_pose"][..., :3, :3], kinds["head_pose"][..., :3, 3]
-        elif "rvec" in kinds and ("tvec" in kinds or "face_center" in kinds):
-            head, centre = rotation_matrix(kinds["rvec"]), kinds.get("tvec")
+        if "head_pose" in values:
+            head, centre = values["head_pose"][..., :3, :3], values["head_pose"][..., :3, 3]
+        elif "rvec" in values and ("tvec" in values or "face_center" in values):
+            head, centre = rotation_matrix(values["rvec"]), values.get("tvec")
         else:
             raise ValueError(f"{self._name}: a sample must have head_pose, or rvec and tvec; got {', '.join(sample)}")
-        centre = kinds.get("face_center", centre)
+        centre = values.get("face_center", centre)
         moved = self._moved(sample, batch, self.change(camera, head, centre))
         moved.pop(PLACE, None)
         scale = self.distance / centre.norm(dim=-1)
