@@ -15,7 +15,7 @@ from camtorch.native.structure import layout
 _HERE = Path(__file__).resolve().parent
 _BUILD = "python -m camtorch.native.build"
 _HEADERS = "python -m camtorch.native.headers"
-# 78 of the 94 rows of docs/performance.json with both figures are within these
+# most rows of docs/performance.json with both figures are within these
 _SLOWER = "without it most work on the CPU takes 4 to 80 times as long"
 _told: set[str] = set()
 
@@ -34,10 +34,9 @@ def _find() -> tuple[Library | None, str]:
         library = Library(str(path))
     except OSError as error:
         return None, f"not loaded ({error}); `{_BUILD}` builds it again; {_SLOWER}"
-    here, (built_from, laid_out) = (
-        checksum(),
-        (_number(library, name) for name in ("camtorch_sources", "camtorch_layout")),
-    )
+    here = checksum()
+    built_from = _number(library, "camtorch_sources")
+    laid_out = _number(library, "camtorch_layout")
     if here is not None and built_from != here:  # None if a package leaves the sources out
         why = "not used (built from other sources than those beside it)"
         return None, f"{why}; `{_BUILD}` or `pip install -e .` builds it again; {_SLOWER}"
