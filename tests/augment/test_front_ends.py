@@ -246,6 +246,7 @@ def test_what_would_not_move_or_be_misread_is_refused(vision):
             call(sample)
     with pytest.raises(TypeError, match=r"a sample must be given, as in transform\(image, target\) or .*; got nothing"):
         transform()
+    torch.manual_seed(0)  # one draw in twenty leaves no pixel empty
     # as v2 has it, but for names that say something else
     out = transform({"gaze": torch.tensor([[0.0, 0.0, 1.0]]), "frame": image + 1, "weight": 0.5, "label": 3})
     assert out["gaze"].shape == (1, 3)
