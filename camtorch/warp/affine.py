@@ -41,7 +41,7 @@ Map = Tensor | Rows
 
 
 class ImageEdit(NamedTuple):
-    """The way an image is made: copied; resized by torch; or, without `move` and `box`, halved and sampled."""
+    """How an image is made: copied; resized by torch; or, without `move` and `box`, halved and sampled."""
 
     padding_mode: PaddingMode
     halvings: int = 0
@@ -68,38 +68,38 @@ class UncheckedWarp(Warp):
         """Return warped images; each one may be copied, resized, or halved and sampled, see `ImageEdit`."""
         smooth = sampler.mode != "nearest" and images.dtype != torch.bool
         called = torch.compiler.is_compiling() and not torch.onnx.is_in_onnx_export()
-        if called and self._ways_need_values(smooth) and not keeps_graph(images, *self.tensors):
+        if called and self._edits_need_values(smooth) and not keeps_graph(images, *self.tensors):
             options = self.antialias, sampler.padding_mode, sampler
             cameras = self.source, self.target, self.rotation
             matrix = None if self.map is None else map_as_tensor(self.map)
             return compiled.warped(images, *cameras, self.tolerance, *options, matrix, _edited)
         route = route or self.route(images)
-        ways = None if in_transform() else self._ways(sampler, smooth, route)
-        if not ways:
+        edits = None if in_transform() else self._edits(sampler, smooth, route)
+        if not edits:
             return super().warped(images, sampler, route)
-        images = images.expand(len(ways), -1, -1, -1) if len(ways) > 1 else images
-        if all(way == ways[0] for way in ways):
-            return self._made(images, ways[0], sampler, route)
+        images = images.expand(len(edits), -1, -1, -1) if len(edits) > 1 else images
+        if all(edit == edits[0] for edit in edits):
+            return self._made(images, edits[0], sampler, route)
         result = self._empty(images)
-        for way in dict.fromkeys(ways):
-            rows = [i for i, other in enumerate(ways) if other == way]
-            if way.move or way.box:
+        for edit in dict.fromkeys(edits):
+            rows = [i for i, other in enumerate(edits) if other == edit]
+            if edit.move or edit.box:
                 for i in rows:
-                    self._made(images[i : i + 1], way, sampler, route, out=result[i : i + 1])
+                    self._made(images[i : i + 1], edit, sampler, route, out=result[i : i + 1])
                 continue
             index = torch.tensor(rows, device=images.device)
-            made = self._made(images[index], way, sampler, route, index)
+            made = self._made(images[index], edit, sampler, route, index)
             for row, one in zip(rows, made, strict=True):  # unsigned integers have no index_put
                 result[row] = one
         return result
 
-    def _ways_need_values(self, smooth: bool) -> bool:
-        """Whether the ways depend on values, which are not known while code is traced."""
+    def _edits_need_values(self, smooth: bool) -> bool:
+        """Whether edits depend on values, which are not known while code is traced."""
         mixed = self.source.is_mixed or self.target.is_mixed
         return self.antialias is None and smooth and self.moves_by_cameras and not mixed
 
-    def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[ImageEdit] | None:
-        """Return the way of each row, or one for all; None to sample as any `Warp` does."""
+    def _edits(self, sampler: Sampler, smooth: bool, route: Route) -> list[ImageEdit] | None:
+        """Return the edit of each image, or one for all; None to sample as any `Warp` does."""
         if not (self.antialias is None and smooth and route == "kept" and are_concrete(self.target.intrinsics)):
             return None
         if self._halvings is None:
@@ -110,43 +110,44 @@ class UncheckedWarp(Warp):
     def _made(
         self,
         images: Tensor,
-        way: ImageEdit,
+        edit: ImageEdit,
         sampler: Sampler,
         route: Route,
         rows: Tensor | None = None,
         out: Tensor | None = None,
     ) -> Tensor:
-        """Return images made in one way, of these rows or all; unless they are sampled they may be written to `out`."""
-        if way.move:
+        """Return images made by one edit, of these rows or all; copies and resized ones may be written to `out`."""
+        if edit.move:  # copy pixels: a quarter turn swaps the axes, and a negative sign along an axis flips it
             result = self._empty(images) if out is None else out
             height, width = result.shape[-2:]
-            a, b, left, c, d, top = way.move
+            a, b, left, c, d, top = edit.move
             view = images.mT if b else images
             dims = [dim for dim, sign in ((-1, a + b), (-2, c + d)) if sign < 0]
             if dims:  # torch cannot flip unsigned dtypes
                 signed = SIGNED.get(view.dtype)  # a view by dtype, even the same one, drops the gradient
                 view = view.flip(dims) if signed is None else view.view(signed).flip(dims).view(view.dtype)
-            # move the origin to the first pixel of the view
+            # where the first pixel of the view goes: the map says it of pixel (0, 0), which a flip moves to the end
             left -= (view.shape[-1] - 1) * (a + b < 0)
             top -= (view.shape[-2] - 1) * (c + d < 0)
-            x, y, right, bottom = max(left, 0), max(top, 0), left + view.shape[-1], top + view.shape[-2]
-            right, bottom = max(min(right, width), x), max(min(bottom, height), y)
+            # the part of the result that the view covers, which may be empty
+            x, right = max(left, 0), min(left + view.shape[-1], width)
+            y, bottom = max(top, 0), min(top + view.shape[-2], height)
+            right, bottom = max(right, x), max(bottom, y)
             if (x, y, right, bottom) != (0, 0, width, height):
                 result[:] = as_pixels(sampler.fill, result.dtype, result.device)
             result[:, :, y:bottom, x:right] = view[..., y - top : bottom - top, x - left : right - left]
             return result
-        if way.box:
-            left, top, right, bottom = way.box
-            images, size = images[..., top:bottom, left:right], self.image_size
-            made = _resized(images, size, sampler.mode, way.flips)
+        if edit.box:
+            left, top, right, bottom = edit.box
+            made = _resized(images[..., top:bottom, left:right], self.image_size, sampler.mode, edit.flips)
             return made if out is None else out.copy_(made)
-        sampler = sampler._replace(padding_mode=way.padding_mode)
-        if rows is None and not way.halvings:
+        sampler = sampler._replace(padding_mode=edit.padding_mode)
+        if rows is None and not edit.halvings:
             return super().warped(images, sampler, route)
         images = self.lengthened(images)
-        if way.halvings:
-            images = _resized(images, [max(-(-side >> way.halvings), 1) for side in images.shape[-2:]])
-        where = self.positions(route, way.padding_mode)
+        if edit.halvings:
+            images = _resized(images, [max(-(-side >> edit.halvings), 1) for side in images.shape[-2:]])
+        where = self.positions(route, edit.padding_mode)
         return render(images, where if rows is None else where.cameras(rows), sampler)
 
     def _empty(self, images: Tensor) -> Tensor:
@@ -181,7 +182,7 @@ class AffineWarp(UncheckedWarp):
         dtype = torch.float32 if device.type in WITHOUT_FLOAT64 else given.dtype
         self.register_buffer("matrix", given.to(device, dtype), persistent=False)
         self.batch_shape: torch.Size = broadcast_shapes(self.batch_shape, given.shape[:-2])
-        # the way depends on numbers on the CPU alone: it is the same on every device, and waits for none
+        # an edit depends on numbers on the CPU alone: it is the same on every device, and waits for none
         self._numbers: list[Rows] = given.reshape(-1, 2, 3).tolist() if given is matrix and are_concrete(given) else []
         if not isinstance(matrix, Tensor):
             self._numbers = [matrix]
@@ -202,14 +203,14 @@ class AffineWarp(UncheckedWarp):
         """Return this warp: pure copies need no sampling positions, others keep them from the first call."""
         return self
 
-    def _ways_need_values(self, smooth: bool) -> bool:
+    def _edits_need_values(self, smooth: bool) -> bool:
         return not self._numbers
 
-    def _ways(self, sampler: Sampler, smooth: bool, route: Route) -> list[ImageEdit] | None:
+    def _edits(self, sampler: Sampler, smooth: bool, route: Route) -> list[ImageEdit] | None:
         least = {True: 1.0, None: SHRINKS, False: math.inf}[self.antialias] if smooth else math.inf
         decides = smooth and self.antialias is None and route == "kept"
         sizes = self.source.size_for("Warp"), self.image_size
-        return [_way(rows, *sizes, sampler.padding_mode, least, decides) for rows in self._numbers]
+        return [_edit_of(rows, *sizes, sampler.padding_mode, least, decides) for rows in self._numbers]
 
     @property
     def tensors(self) -> list[Tensor]:
@@ -217,20 +218,21 @@ class AffineWarp(UncheckedWarp):
 
     def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Positions:
         width = self.image_size[1]
-        back = inverted(self.matrix.reshape(-1, 2, 3))
+        back = inverted(self.matrix.reshape(-1, 2, 3))  # from the target to the source
         side = back.new_tensor(self.source.size_for("Warp")[::-1])[:, None]
         # pixels to positions: (2 u + 1) / W - 1
         back = torch.cat((back[:, :, :2] * 2 / side, (2 * back[:, :, 2:] + 1) / side - 1), -1)
         dtype = torch.promote_types(self.source.intrinsics.dtype, torch.float32)
         if tolerance and not self.antialias and back.is_cpu and not is_unknown(back):
             return straight_lattice(back, rows, width, dtype)
-        v, u = (torch.arange(n, dtype=back.dtype, device=back.device) for n in (len(rows), width))
-        v = v + rows.start
+        u = torch.arange(width, dtype=back.dtype, device=back.device)
+        v = torch.arange(len(rows), dtype=back.dtype, device=back.device) + rows.start
         a, b, c = (w.unsqueeze(-1).unsqueeze(-1) for w in back.unbind(-1))
         grid = (a * u + b * v[:, None] + c).movedim(1, -1).to(dtype)
         mapped = torch.ones_like(grid[..., 0], dtype=torch.bool)
         if not self.antialias:
             return PixelPositions(grid, mapped, None)
+        # undo 2 / W; how many source pixels lie between neighbours is the same all over the image
         scale = (back[:, :, :2] * side / 2).abs().sum(-1).amax(-1)
         return PixelPositions(grid, mapped, scale.to(dtype)[:, None, None].expand(mapped.shape).contiguous())
 
@@ -260,31 +262,33 @@ def _resized(images: Tensor, size: Sequence[int], mode: str = "bilinear", flips:
     return made if plain else narrow(made, images.dtype)
 
 
-def _way(
-    rows: Rows, before: tuple[int, int], after: tuple[int, int], padding: PaddingMode, least: float, decides: bool
+def _edit_of(
+    rows: Rows, source: tuple[int, int], target: tuple[int, int], padding: PaddingMode, least: float, decides: bool
 ) -> ImageEdit:
-    """Return how a map edits images of size `before`; torch resizes them if more than `least` pixels become one."""
+    """Return how a map edits images of one size into another; torch resizes if more than `least` pixels become one."""
+    # whole pixels, flips and quarter turns are copied
     (a, b, left), (c, d, top) = rows
     whole = tuple(round(x) for x in (a, b, left, c, d, top))
     near = all(abs(x - n) < _MAP_ROUNDING for x, n in zip((a, b, left, c, d, top), whole, strict=True))
     if near and abs(a) + abs(b) == abs(c) + abs(d) == 1 and padding == "zeros":
         return ImageEdit(padding, move=whole)
+    # two opposite corners of the target, as places on the source from the outer corner of its first pixel
     (a, b, left), (c, d, top) = inverted(rows)
-    # two opposite corners of the edited image, from the outer corner of the source's first pixel
-    corners = (-0.5, -0.5), (after[1] - 0.5, after[0] - 0.5)
+    corners = (-0.5, -0.5), (target[1] - 0.5, target[0] - 0.5)
     ends = [(a * u + b * v + left + 0.5, c * u + d * v + top + 0.5) for u, v in corners]
     (x, right), (y, bottom) = (sorted(places) for places in zip(*ends, strict=True))
     is_inside = (
         min(x, y) > -_INVERSE_ROUNDING
-        and right < before[1] + _INVERSE_ROUNDING
-        and bottom < before[0] + _INVERSE_ROUNDING
+        and right < source[1] + _INVERSE_ROUNDING
+        and bottom < source[0] + _INVERSE_ROUNDING
     )
+    # a box of whole pixels that shrinks is resized; others are sampled, and may be halved first
     box = tuple(round(edge) for edge in (x, y, right, bottom))
     near = all(abs(edge - n) < _INVERSE_ROUNDING for edge, n in zip((x, y, right, bottom), box, strict=True))
     if near and is_inside and b == 0 and max(abs(a), abs(d)) > least:
         return ImageEdit(padding, box=box, flips=tuple(dim for dim, sign in ((-1, a), (-2, d)) if sign < 0))
     halvings = _halved((math.hypot(a, c) + math.hypot(b, d)) / 2) if decides else 0
-    # inside of the source, up to the outer edges of its pixels, a target needs no padding
+    # a target inside of the source, up to the outer edges of its pixels, needs no padding
     return ImageEdit("border" if is_inside and padding == "zeros" else padding, halvings)
 
 
@@ -296,17 +300,19 @@ def _halved(scale: float) -> int:
 def _halvings(where: Positions, source: Camera) -> list[int]:
     """Return for every camera how often to halve its image, measured at the same target pixels on all routes."""
     first, step = coarse(where.size)
-    planes = where.every(first, step)
-    seen = (planes.abs() <= 1).all(1)
+    grid = where.every(first, step)
+    seen = (grid.abs() <= 1).all(1)
     height, width = source.size_for("Warp")
-    grid, planes = planes, planes * planes.new_tensor([width / 2, height / 2])[:, None, None]
-    total, count = planes.new_zeros(len(planes)), planes.new_zeros(len(planes))
+    pixels = grid * grid.new_tensor([width / 2, height / 2])[:, None, None]
+    # the mean step between neighbours that the source sees both, across and down
+    total = count = grid.new_zeros(len(grid))
     for dim in (-1, -2):
-        n = planes.shape[dim] - 1
-        (across, down), (u, v) = planes.diff(dim=dim).unbind(1), grid.narrow(dim, 0, n).unbind(1)
-        steps = lengths(source, (across, down), (u, v))
+        n = grid.shape[dim] - 1
+        across, down = pixels.diff(dim=dim).unbind(1)
+        u, v = grid.narrow(dim, 0, n).unbind(1)
         both = seen.narrow(dim, 0, n) & seen.narrow(dim, 1, n)
-        total, count = total + (steps * both).sum((1, 2)), count + both.sum((1, 2))
+        total = total + (lengths(source, (across, down), (u, v)) * both).sum((1, 2))
+        count = count + both.sum((1, 2))
     return [_halved(scale) for scale in (total / (count.clamp(min=1) * step)).tolist()]
 
 
@@ -314,7 +320,7 @@ def _halvings(where: Positions, source: Camera) -> list[int]:
 def _edited(
     images: Tensor, source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, *options: Any
 ) -> tuple[Tensor]:
-    """Return the images of an edit, made in the way that its values choose; see `compiled.warped` for the options."""
+    """Return the images of an edit, as its values choose it; see `compiled.warped` for the options."""
     *texts, matrix, is_last = options
     antialias, _, sampler = compiled.read(*texts)
     how: Any = {**sampler._asdict(), "antialias": antialias, "tolerance": tolerance}
@@ -331,8 +337,8 @@ def map_as_tensor(matrix: Map) -> Tensor:
 
 def inverted(matrix: Map) -> Any:
     """Return the inverse maps (*B, 2, 3)."""
-    rows: Any = matrix.flatten(-2).unbind(-1) if isinstance(matrix, Tensor) else (*matrix[0], *matrix[1])
-    a, b, left, c, d, top = rows
+    numbers: Any = matrix.flatten(-2).unbind(-1) if isinstance(matrix, Tensor) else (*matrix[0], *matrix[1])
+    a, b, left, c, d, top = numbers
     scale = 1 / (a * d - b * c)
     a, b, c, d = d * scale, -b * scale, -c * scale, a * scale
     rows = (a, b, -(a * left + b * top)), (c, d, -(c * left + d * top))
