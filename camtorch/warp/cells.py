@@ -1,4 +1,8 @@
-"""The cells of a lattice: which of them polynomials through nodes may miss, and what is laid there instead."""
+"""The cells of a lattice: which of them polynomials through nodes may miss, and what is laid there instead.
+
+`classify` tells a cell's kind by its nodes; cells in doubt are settled by exact positions. To lay a cell is to write
+positions of its pixels: `lay_quintics` does so here, and `grid.py` with exact ones.
+"""
 
 from __future__ import annotations
 
@@ -46,14 +50,14 @@ def classify(
     padding: str,
 ) -> Tensor:
     """Return the kinds (B, n, m) int32 of a lattice's cells; `native.sampler.classify` explains kinds and arguments."""
-    n, m = nodes.shape[-2] - 5, nodes.shape[-1] - 5
-    half = nodes.new_tensor(source[::-1])[:, None, None] / 2
-    across, down = nodes[:, :, 2:-2].diff(4).abs(), nodes[..., 2:-2].diff(4, dim=2).abs()
-    around, known = nodes[:, :, 1:-1, 1:-1], mapped[:, None, 1:-1, 1:-1].to(nodes.dtype)
-    # fourth differences at a cell's corners and the next ones on either side, and a cell's sixteen nodes
-    corners = F.pad(torch.cat((across, down), 1), (1, 1, 1, 1), value=-math.inf)
-    most = torch.cat((corners, around, -around, known, -known), 1)
+    # of each cell: the largest fourth differences at its corners and the next ones on either side; of its sixteen nodes
+    # the highest position and the lowest one, negated; and whether some are mapped, and all, as 1 and -1
+    fourth = torch.cat((nodes[:, :, 2:-2].diff(4).abs(), nodes[..., 2:-2].diff(4, dim=2).abs()), 1)
+    around = nodes[:, :, 1:-1, 1:-1]
+    known = mapped[:, None, 1:-1, 1:-1].to(nodes.dtype)
+    most = torch.cat((F.pad(fourth, (1, 1, 1, 1), value=-math.inf), around, -around, known, -known), 1)
     across, down, high, low, some, every = _largest(most, 4, 4).split((2, 2, 2, 2, 1, 1), 1)
+    half = nodes.new_tensor(source[::-1])[:, None, None] / 2  # pixels of one unit of a position
     missed = (CELL_MISSED * half * (across + down)).square()
     reach = CELL_MARGIN + CELL_OVERSHOOT * (high + low)
     near = (high + reach > -1) & (low + reach > -1)
@@ -63,7 +67,8 @@ def classify(
     doubt = doubt & near.all(1) if padding == "zeros" else doubt
     cells = torch.where(doubt, CELL_DOUBT, CELL_CUBIC).to(torch.int32)
     cells.masked_fill_(every[:, 0] == 0, CELL_TODO).masked_fill_(some[:, 0] == 0, CELL_EMPTY)
-    # a pixel at the rim may say that the nodes do not tell all
+    # a pixel at the rim, unlike its cell in what is mapped, says that the nodes do not tell all
+    n, m = cells.shape[1:]
     down, across = (torch.arange(length, device=nodes.device) // STEP for length in size)
     at = torch.cat((across, across + (n - 1) * m, down * m, down * m + (size[1] - 1) // STEP))
     flat = cells.flatten(1)
@@ -101,7 +106,7 @@ def settle(
     tolerance: float,
     padding: str,
 ) -> None:
-    """Find out about cells in doubt: polynomials miss most in the middle of a cell and of its sides.
+    """Decide about cells in doubt: polynomials miss most in the middle of a cell and of its sides.
 
     Cells become `CELL_CUBIC` if cubics keep half the tolerance there, or if an image that ends in zeros is far off;
     else `CELL_QUINTIC` if polynomials through six nodes keep it; else `CELL_TODO`. The target's first row is `first`.
@@ -109,25 +114,27 @@ def settle(
     doubt = cells == CELL_DOUBT
     if not bool(doubt.any()):
         return
+    # exact positions in the middles, and the nodes that polynomials go through
     chosen, wanted = places(doubt)
-    probes = nodes.new_tensor(_PROBES)
     corners = torch.stack((chosen % cells.shape[2], chosen // cells.shape[2]), -1) * STEP
     corners[..., 1] += first
-    positions, known = exact(corners.unsqueeze(2) + probes)
-    # (B, K, 2, 5), (B, K, 2, 6, 6)
+    positions, known = exact(corners.unsqueeze(2) + nodes.new_tensor(_PROBES))
+    positions = positions.movedim(-1, 2).to(nodes.dtype)  # (B, K, 2, 5)
     cameras = torch.arange(len(cells), device=cells.device)[:, None]
-    positions, around = positions.movedim(-1, 2).to(nodes.dtype), _around(nodes, cameras, chosen)
-    half, limit = nodes.new_tensor(source[::-1]) / 2, tolerance * tolerance / 4
+    around = _around(nodes, cameras, chosen)  # (B, K, 2, 6, 6)
+    half = nodes.new_tensor(source[::-1]) / 2
+    limit = tolerance * tolerance / 4
 
     def missed(count: int) -> Tensor:
         """Return squared pixels (B, K, 2, 5) between the probes and polynomials through `count` x `count` nodes."""
+        # as in `_PROBES`: rows 2 and 3 are the upper and the lower side, columns 2 and 3 the left and the right one
         weights = nodes.new_tensor(_MIDDLE[count])
         lines = (around * weights).sum(-1)
         sides = (around[..., 2:4] * weights[:, None]).sum(-2)
         said = torch.cat((lines[..., 2:3], sides, lines[..., 3:4], (lines * weights).sum(-1, keepdim=True)), -1)
         return ((positions - said) * half[:, None]).square()
 
-    by_cubics, every = missed(4), known.all(-1)
+    by_cubics = missed(4)
     is_cubic = by_cubics.sum(2).amax(-1) <= limit
     if padding == "zeros":
         seen = torch.cat((positions, around[..., 2, 2, None]), -1)
@@ -139,13 +146,14 @@ def settle(
     inside = _around(mapped[:, None], cameras, chosen).flatten(2).all(-1)
     is_quintic = inside & (missed(6).sum(2).amax(-1) <= limit / 16)
     kinds = torch.where(is_quintic, CELL_QUINTIC, CELL_TODO).masked_fill_(is_cubic, CELL_CUBIC)
-    kinds.masked_fill_(~every, CELL_TODO)
+    kinds.masked_fill_(~known.all(-1), CELL_TODO)
     put(cells, chosen, wanted, kinds)
 
 
 def prefer_quintics(nodes: Tensor, cells: Tensor, source: tuple[int, int], tolerance: float) -> None:
     """Turn each `CELL_CUBIC` into a `CELL_QUINTIC` whose quintic misses the cubic by half the tolerance at most."""
-    half, apart = nodes.new_tensor(source[::-1])[:, None, None] / 2, []
+    half = nodes.new_tensor(source[::-1])[:, None, None] / 2
+    apart = []
     for dim, other in ((2, 3), (3, 2)):
         # in the middle of two nodes they differ by 3/256 of the fourth differences at both
         at = nodes.diff(4, dim=dim)
@@ -192,8 +200,9 @@ def lay_quintics(nodes: Tensor, cells: Tensor, count: int) -> Tensor:
 def _quintics() -> Tensor:
     """Return weights (8, 6) of six nodes in their quintic, on the way from the third to the fourth one; on the CPU."""
     with torch.inference_mode(False):
-        t, steps = torch.arange(STEP, dtype=torch.float64, device="cpu")[:, None] / STEP + 2, range(6)
-        return torch.cat([reduce(torch.mul, [(t - k) / (j - k) for k in steps if k != j]) for j in steps], -1)
+        t = torch.arange(STEP, dtype=torch.float64, device="cpu")[:, None] / STEP + 2
+        # by Lagrange: of node j, 1 there and 0 at the others
+        return torch.cat([reduce(torch.mul, [(t - k) / (j - k) for k in range(6) if k != j]) for j in range(6)], -1)
 
 
 def _around(nodes: Tensor, camera: Tensor, place: Tensor) -> Tensor:
