@@ -1,6 +1,7 @@
 """Operators that compiled graphs call instead of tracing: a warp of images, and sampling positions with a tolerance.
 
-Exported programs know them by the name of this module.
+Exported programs know them by the name of this module. Operators take neither flags nor
+fills, so that options are `written` as texts, and `is_last` is "True" if channels come last in memory, else "False".
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ def read(antialias: str, padding: str, mode: Any, padding_mode: Any, fill: str) 
 
 
 def laid(images: Tensor, is_last: str) -> Tensor:
-    """Return images with their channels last in memory, or plane by plane."""
+    """Return images with their channels last in memory if `is_last` is "True", else plane by plane."""
     return images.contiguous(memory_format=torch.channels_last if is_last == "True" else torch.contiguous_format)
 
 
@@ -101,7 +102,7 @@ _located = Kept(2)  # masks are warped after their images, and cameras may stay 
 def _warp(
     images: Tensor, source: Camera, target: Camera, rotation: Tensor | None, tolerance: float, *options: str
 ) -> tuple[Tensor]:
-    """Return images (B, C, h, w), plane by plane or with their channels last in memory; see `warped`."""
+    """Return images (B, C, h, w); see `warped`."""
     *texts, is_last = options
     antialias, padding, how = read(*texts)
     every = range(target.size_for("Warp")[0])
