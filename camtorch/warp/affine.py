@@ -34,7 +34,6 @@ _PLAIN_DTYPES = (torch.uint8, torch.float32, torch.float64)  # torch interpolate
 _MAP_ROUNDING = 1e-9  # pixels: a number of a map this close to a whole one counts as whole
 _INVERSE_ROUNDING = 1e-6  # pixels: the same for the inverse map
 
-
 Rows = tuple[tuple[float, float, float], tuple[float, float, float]]
 Map = Tensor | Rows
 """(*B, 2, 3) float64, from pixels (u, v, 1) to pixels; `Rows` if one map, known while code is traced, serves all."""
@@ -266,7 +265,6 @@ def _edit_of(
     rows: Rows, source: tuple[int, int], target: tuple[int, int], padding: PaddingMode, least: float, decides: bool
 ) -> ImageEdit:
     """Return how a map edits images of one size into another; torch resizes if more than `least` pixels become one."""
-    # whole pixels, flips and quarter turns are copied
     (a, b, left), (c, d, top) = rows
     whole = tuple(round(x) for x in (a, b, left, c, d, top))
     near = all(abs(x - n) < _MAP_ROUNDING for x, n in zip((a, b, left, c, d, top), whole, strict=True))
@@ -277,14 +275,11 @@ def _edit_of(
     corners = (-0.5, -0.5), (target[1] - 0.5, target[0] - 0.5)
     ends = [(a * u + b * v + left + 0.5, c * u + d * v + top + 0.5) for u, v in corners]
     (x, right), (y, bottom) = (sorted(places) for places in zip(*ends, strict=True))
-    is_inside = (
-        min(x, y) > -_INVERSE_ROUNDING
-        and right < source[1] + _INVERSE_ROUNDING
-        and bottom < source[0] + _INVERSE_ROUNDING
-    )
+    slack = _INVERSE_ROUNDING
+    is_inside = min(x, y) > -slack and right < source[1] + slack and bottom < source[0] + slack
     # a box of whole pixels that shrinks is resized; others are sampled, and may be halved first
     box = tuple(round(edge) for edge in (x, y, right, bottom))
-    near = all(abs(edge - n) < _INVERSE_ROUNDING for edge, n in zip((x, y, right, bottom), box, strict=True))
+    near = all(abs(edge - n) < slack for edge, n in zip((x, y, right, bottom), box, strict=True))
     if near and is_inside and b == 0 and max(abs(a), abs(d)) > least:
         return ImageEdit(padding, box=box, flips=tuple(dim for dim, sign in ((-1, a), (-2, d)) if sign < 0))
     halvings = _halved((math.hypot(a, c) + math.hypot(b, d)) / 2) if decides else 0

@@ -50,8 +50,8 @@ def classify(
     padding: str,
 ) -> Tensor:
     """Return the kinds (B, n, m) int32 of a lattice's cells; `native.sampler.classify` explains kinds and arguments."""
-    # of each cell: the largest fourth differences at its corners and the next ones on either side; of its sixteen nodes
-    # the highest position and the lowest one, negated; and whether some are mapped, and all, as 1 and -1
+    # of a cell: the largest fourth differences at its corners and the next ones on either side; and of its 16 nodes
+    # the highest position, the lowest one negated, and whether some (1) and whether all (-1) are mapped
     fourth = torch.cat((nodes[:, :, 2:-2].diff(4).abs(), nodes[..., 2:-2].diff(4, dim=2).abs()), 1)
     around = nodes[:, :, 1:-1, 1:-1]
     known = mapped[:, None, 1:-1, 1:-1].to(nodes.dtype)
@@ -114,7 +114,6 @@ def settle(
     doubt = cells == CELL_DOUBT
     if not bool(doubt.any()):
         return
-    # exact positions in the middles, and the nodes that polynomials go through
     chosen, wanted = places(doubt)
     corners = torch.stack((chosen % cells.shape[2], chosen // cells.shape[2]), -1) * STEP
     corners[..., 1] += first
@@ -198,10 +197,9 @@ def lay_quintics(nodes: Tensor, cells: Tensor, count: int) -> Tensor:
 
 @lru_cache(maxsize=1)
 def _quintics() -> Tensor:
-    """Return weights (8, 6) of six nodes in their quintic, on the way from the third to the fourth one; on the CPU."""
+    """Return Lagrange's weights (8, 6) of six nodes, on the way from the third to the fourth one; on the CPU."""
     with torch.inference_mode(False):
         t = torch.arange(STEP, dtype=torch.float64, device="cpu")[:, None] / STEP + 2
-        # by Lagrange: of node j, 1 there and 0 at the others
         return torch.cat([reduce(torch.mul, [(t - k) / (j - k) for k in range(6) if k != j]) for j in range(6)], -1)
 
 
