@@ -71,7 +71,8 @@ def call_for(
             the dtype of the cameras, rays and rotation vectors (*N, 3) and columns (3 or 4, N) that turn.
         batched: whether there is a dim B.
     """
-    tolerance, antialias, count = options["tolerance"], options["antialias"], len(values[0]) if batched else 1
+    tolerance, antialias = options["tolerance"], options["antialias"]
+    count = len(values[0]) if batched else 1
     if not tolerance or antialias:
         return None
     if count > 1:
@@ -84,18 +85,17 @@ def call_for(
 
     def made() -> SampleCall | None:
         n, m = (math.ceil(side / structs.STEP) for side in sizes[1])
-        if (
-            min(n, m) < FEWEST_CELLS or (n + 5) * (m + 5) > MOST_KEPT_NODES
-        ):  # too small for a lattice, or too large to be kept
+        # too small for a lattice, or too large to be kept
+        if min(n, m) < FEWEST_CELLS or (n + 5) * (m + 5) > MOST_KEPT_NODES:
             return None
         for value, how in zip(values, hows, strict=True):
-            if not isinstance(how, Sampler):
-                if torch.promote_types(value.dtype, dtype) != dtype:
-                    return None
-                continue
-            image = _as_images(value, batched)
-            result = maker(image, count, sizes[1])()
-            if 0 in result.shape or not takes(image.dtype, how.mode) or not is_quick(image, result, how.mode):
+            if isinstance(how, Sampler):
+                image = _as_images(value, batched)
+                result = maker(image, count, sizes[1])()
+                serves = 0 not in result.shape and takes(image.dtype, how.mode) and is_quick(image, result, how.mode)
+            else:
+                serves = torch.promote_types(value.dtype, dtype) == dtype
+            if not serves:
                 return None
         return SampleCall(*given, count, values, hows)
 
@@ -120,9 +120,10 @@ def _surely_keeps_size(back: NativeMove, sizes: Sizes) -> bool:
     places = back.rows(nodes, structs.POSITIONS)[0].numpy().reshape(-1, *shape, 2)
     seen: np.ndarray[Any, Any] = np.all(abs(places) <= 1, axis=-1)
     places = places * np.array([sizes[0][1] / 2, sizes[0][0] / 2], places.dtype)
-    down, across = places[:, 1:] - places[:, :-1], places[:, :, 1:] - places[:, :, :-1]
-    total, count = 0.0, 0
-    for steps, both in ((down, seen[:, 1:] & seen[:, :-1]), (across, seen[:, :, 1:] & seen[:, :, :-1])):
+    down = places[:, 1:] - places[:, :-1], seen[:, 1:] & seen[:, :-1]
+    across = places[:, :, 1:] - places[:, :, :-1], seen[:, :, 1:] & seen[:, :, :-1]
+    total, count = 0.0, 0  # of the steps between neighbours that are both seen
+    for steps, both in (down, across):
         total = total + (np.hypot(steps[..., 0], steps[..., 1]) * both).sum((1, 2))
         count = count + both.sum((1, 2))
     return bool((total < SURELY * SHRINKS * step * np.maximum(count, 1)).all())
@@ -135,7 +136,7 @@ def _as_images(value: Tensor, batched: bool) -> Tensor:
 
 
 def _image_maker(value: Tensor, batched: bool, make: Callable[[], Tensor]) -> Callable[[], Tensor]:
-    """Return a function that makes an empty tensor of the dims of `value`; make: one of (B, C, H, W)."""
+    """Return what makes an empty image or mask like `value`; make: what makes images (B, C, H, W)."""
     is_image = value.ndim == 3 + batched
 
     def made() -> Tensor:
@@ -168,13 +169,15 @@ class SampleCall:
     ):
         """Take the arguments of `call_for`; decides: whether images that shrink are antialiased, unlike here."""
         self._sizes, self._dtype, self._count, self._batched = sizes, dtype, count, batched
+        # the lattice by which all images are sampled
         samplers = [how for how in hows if isinstance(how, Sampler)]
         padding = serving_all("zeros", *(how.padding_mode for how in samplers))
         with torch.inference_mode(False):
-            nodes = probes(0, sizes[1], dtype)
-            self._lattices = Lattices(nodes, sizes[1], sizes[0], tolerance, padding, count)
+            self._lattices = Lattices(probes(0, sizes[1], dtype), sizes[1], sizes[0], tolerance, padding, count)
+        # arrays of C: a job for each image, a move for pixels and boxes, and a turn for rays and the like
         images, moving = len(samplers), sum(how in ("pixels", "boxes") for how in hows)
-        self._jobs, moves = (structs.Job * images)(), (structs.Move * moving)()
+        self._jobs = (structs.Job * images)()
+        moves = (structs.Move * moving)()
         turns = (structs.Turned * (len(hows) - images - moving))()
         call = self._call = structs.Together(job_count=images, move_count=moving, turned_count=len(turns))
         call.jobs, call.moves, call.turned = (call.keep(array) for array in (self._jobs, moves, turns))
@@ -186,36 +189,34 @@ class SampleCall:
             self._back.next = None  # one thread makes the lattice, and needs no counter of those made
         self._most_tiles = 1  # of the images, each of which threads share
         self._readers: list[Reader] = []  # of each value
+        self._copied: list[int] = []  # which values C reads from copies
+        self._decides = False  # whether each run asks if images shrink, which are antialiased elsewhere
         free_jobs, free_moves, free_turns = iter(self._jobs), iter(moves), iter(turns)
-        for value, how in zip(values, hows, strict=True):
+        for i, (value, how) in enumerate(zip(values, hows, strict=True)):
             if isinstance(how, Sampler):
                 reader = self._reader_of_images(next(free_jobs), value, how)
+                self._decides |= decides and how.mode != "nearest" and value.dtype != torch.bool
             elif how in ("pixels", "boxes"):
                 reader = self._reader_of_pixels(next(free_moves), value, 2 if how == "pixels" else 4)
+                if value.dtype != dtype or not value.is_contiguous():
+                    self._copied.append(i)
             else:
                 reader = self._reader_of_vectors(next(free_turns), value, how)
             self._readers.append(reader)
         self._images_of_call = images if count == 1 else 0  # those of a batch are made with their lattices
         self._one_thread = self._most_tiles <= _TILES_FOR_ONE_THREAD or not self._images_of_call  # whether it makes all
-        self._copied = [  # which values C reads from copies
-            i
-            for i, (value, how) in enumerate(zip(values, hows, strict=True))
-            if how in ("pixels", "boxes") and not (value.dtype == dtype and value.is_contiguous())
-        ]
         self._may_be_refused = [i for i, how in enumerate(hows) if how in ("boxes", "pose", "rotation vectors")]
-        self._decides = decides and any(
-            isinstance(how, Sampler) and how.mode != "nearest" and value.dtype != torch.bool
-            for value, how in zip(values, hows, strict=True)
-        )
 
     def _reader_of_images(self, job: structs.Job, like: Tensor, how: Sampler) -> Reader:
+        """Write into a job of C what all runs share, and return what writes the rest in each run; so do the next two."""
         image = _as_images(like, self._batched)
-        make = maker(image, self._count, self._sizes[1])
-        result, make = make(), _image_maker(like, self._batched, make)
+        make_images = maker(image, self._count, self._sizes[1])
+        result = make_images()
         fill = how.fill * image.shape[1] if len(how.fill) == 1 else how.fill
         describe(job, image, result, how.mode, how.padding_mode, fill)
-        self._lattices.lay(job)
+        self._lattices.lay(job)  # has the job sample by the positions of the lattice
         self._most_tiles = max(self._most_tiles, tiles_of(result[:1]))
+        make = _image_maker(like, self._batched, make_images)
 
         def read(value: Tensor, step: int) -> MovedField:
             result = make()
@@ -225,8 +226,10 @@ class SampleCall:
         return read
 
     def _reader_of_pixels(self, move: structs.Move, like: Tensor, each: int) -> Reader:
-        dtype, back, many = self._dtype, self._back, like.numel() // (each * self._count) if self._count else 0
-        move.turn_strides[:], move.cameras, (move.height, move.width) = (0, 3, 1), self._count, self._sizes[1]
+        dtype, back = self._dtype, self._back
+        many = like.numel() // (each * self._count) if self._count else 0
+        move.turn_strides[:] = 0, 3, 1
+        move.cameras, (move.height, move.width) = self._count, self._sizes[1]
         move.form = structs.ON_IMAGE if each == 2 else structs.BOXES
         move.count, move.tile = many, max(many, 1)
         move.row_strides[:] = move.result_strides[:] = each * many, each, 1
@@ -234,6 +237,7 @@ class SampleCall:
         def read(rows: Tensor, step: int) -> MovedField:
             result = torch.empty(rows.shape, dtype=dtype, device="cpu")
             valid = torch.empty(rows.shape[:-1], dtype=torch.bool, device="cpu")
+            # the other way round than `back`, whose strides 1, 3 transpose the rotations
             move.from_, move.to, move.turns = back.to, back.from_, back.turns
             move.turn_strides[0] = step
             move.rows, move.results, move.valid = rows.data_ptr(), result.data_ptr(), valid.data_ptr()
@@ -242,9 +246,11 @@ class SampleCall:
         return read
 
     def _reader_of_vectors(self, turned: structs.Turned, like: Tensor, how: Label) -> Reader:
-        width, is_matrix, back = like.shape[-1], how in ("columns", "pose"), self._back
+        back, width = self._back, like.shape[-1]
+        is_matrix = how in ("columns", "pose")
         turned.strides[:], turned.count = ((1, width), width) if is_matrix else ((3, 1), like.numel() // 3)
-        turned.is_double, turned.form = self._dtype == torch.float64, _FORMS.get(how, structs.RAYS)
+        turned.is_double = self._dtype == torch.float64
+        turned.form = _FORMS.get(how, structs.RAYS)
 
         def read(value: Tensor, step: int) -> MovedField:
             result = value.clone()
@@ -265,7 +271,8 @@ class SampleCall:
         if rotation is not None:
             if rotation.dtype != dtype or not rotation.is_contiguous():
                 rotation = rotation.detach().to(dtype).contiguous()
-            turn, step = rotation.data_ptr(), 9 if rotation.ndim > 2 and len(rotation) > 1 else 0
+            turn = rotation.data_ptr()
+            step = 9 if rotation.ndim > 2 and len(rotation) > 1 else 0  # numbers, from one rotation to the next one
         if self._decides:
             turns = None if rotation is None else rotation.mT
             if not _surely_keeps_size(NativeMove(target, source, turns, self._sizes[0], False), self._sizes):
@@ -278,9 +285,7 @@ class SampleCall:
         back.from_, back.to, back.turns, back.turn_strides[0] = target.pointer, source.pointer, turn, step
         if self._copied:
             values = [value.to(dtype).contiguous() if i in self._copied else value for i, value in enumerate(values)]
-        results: list[MovedField | None] = [
-            read(value, step) for read, value in zip(self._readers, values, strict=True)
-        ]
+        results: list[MovedField | None] = [read(one, step) for read, one in zip(self._readers, values, strict=True)]
         # images of a batch, by the threads that make the lattices
         if self._count > 1 and len(self._jobs):
             run, counters = native.camtorch_lattices, self._lattices.counters
