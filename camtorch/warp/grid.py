@@ -1,4 +1,7 @@
-"""Where a warp samples: exact positions on the source's image, or a lattice of them where that serves."""
+"""Where a warp samples: exact positions on the source's image, or a lattice of them where that serves.
+
+A lattice may be of a part of the target: `first` is the row at which that begins, and `size` its height and width.
+"""
 
 from __future__ import annotations
 
@@ -115,7 +118,7 @@ def _row_by_row(cameras: Between, rows: range) -> tuple[Tensor, Tensor]:
         found, mapped = native.rows(pixels.flatten(0, 1)[None], POSITIONS)
         return found.unflatten(1, pixels.shape[:2]), mapped.unflatten(1, pixels.shape[:2])
 
-    # by strips, which reuse the memory of intermediate results
+    # by strips, which reuse the memory of intermediate results: of fewer rows if there are many cameras
     count = max(math.prod(camera.batch_shape) for camera in (cameras.source, target))
     count = count if cameras.rotation is None else max(count, math.prod(cameras.rotation.shape[:-2]))
     step = max(_STRIP_PIXELS // max(count * target.size_for("Warp")[1], 1), 1)
@@ -180,7 +183,7 @@ def local_scale(grid: Tensor, mapped: Tensor, source: Camera) -> Tensor:
         right, down = grid.narrow(dim, 1, n).unbind(-1)
         step = lengths(source, ((right - u) * (width / 2), (down - v) * (height / 2)), (u, v))
         step = step * (mapped.narrow(dim, 1, n) & mapped.narrow(dim, 0, n))
-        for start in (0, 1):
+        for start in (0, 1):  # a step counts at both of its ends
             part = scale.narrow(dim, start, n)
             part.copy_(torch.maximum(part, step))
     return scale
@@ -265,13 +268,13 @@ def _found_by_torch(
 ) -> Lattice | None:
     """Return the same of exact positions by torch, as of several models in a batch, or without the library."""
     n, m = (math.ceil(side / STEP) for side in size)
-    limits = source_size, _, _ = cameras.source.size_for("Warp"), tolerance, padding
+    source_size = cameras.source.size_for("Warp")
     # the library finds cubics for each cell; torch alone first looks one node further, whether quintics do everywhere
     looks_further = not (learns or native_available())
     shape = (n + 7, m + 7) if looks_further else (n + 5, m + 5)
     pixels = probes(first, size, _like(cameras.target).dtype, shape[0] - n)
     positions, mapped = (t[:, 0] for t in cameras.exact(pixels))
-    count = math.prod(shape)
+    count = math.prod(shape)  # after so many nodes the rim follows
     nodes = positions[:, :count].movedim(-1, 1).contiguous().unflatten(2, shape)
     if looks_further:
         is_smooth = bool(mapped.all()) and are_smooth(nodes, source_size, tolerance)
@@ -279,11 +282,13 @@ def _found_by_torch(
         if is_smooth:
             cells = torch.full((len(nodes), n, m), CELL_QUINTIC, dtype=torch.int32, device=nodes.device)
             return Lattice(nodes, cells, nodes.new_empty(2, 0, STEP, STEP), size)
-    mapped, rim = mapped[:, :count].unflatten(1, shape), mapped[:, count:]
+    # cubics where nodes show that they serve, or exact positions do
+    narrow, rim = nodes.float(), mapped[:, count:]
+    mapped = mapped[:, :count].unflatten(1, shape)
     mapped = mapped[:, 1:-1, 1:-1].contiguous() if looks_further else mapped
-    narrow, find = nodes.float(), sampler.classify if native_available() else classify
-    cells = find(narrow, mapped, rim, size, *limits)
-    settle(cameras.exact, first, cells, narrow, mapped, *limits)
+    find = sampler.classify if native_available() else classify
+    cells = find(narrow, mapped, rim, size, source_size, tolerance, padding)
+    settle(cameras.exact, first, cells, narrow, mapped, source_size, tolerance, padding)
     todo = cells == CELL_TODO
     if not len(cells) or int(todo.sum((1, 2)).max()) > n * m * (1 / 5 if learns else 7 / 8):
         return None
@@ -295,15 +300,15 @@ def _found_by_torch(
 
 def coarse(size: tuple[int, ...]) -> tuple[int, int]:
     """Return the first pixel and the step, in both directions, at which a target (h, w) shows how far images shrink."""
-    return (16, 32) if min(size) >= 64 else (0, STEP) if min(size) > STEP else (0, 1)
+    if min(size) >= 64:
+        return 16, 32
+    return 0, STEP if min(size) > STEP else 1
 
 
 def probes(first: int, size: tuple[int, int], dtype: torch.dtype, more: int = 5) -> Tensor:
     """Return the nodes of a lattice, and then the pixels at the rim of the target, (1, N, 2) on the CPU.
 
-    The target's part of this size begins with row `first`. Of small lattices they are kept for the next one.
-
-    more: how many more nodes than cells there are along an axis.
+    Along an axis there are as many nodes as cells, and `more`. Of small lattices they are kept for the next one.
     """
     nodes = (math.ceil(size[0] / STEP) + more) * (math.ceil(size[1] / STEP) + more)
     return (_kept_probes if nodes <= MOST_KEPT_NODES else _new_probes)(first, size, dtype, more)
@@ -313,9 +318,8 @@ def _new_probes(first: int, size: tuple[int, int], dtype: torch.dtype, more: int
     with torch.inference_mode(False):
         down, across = (torch.arange(length, dtype=dtype, device="cpu") for length in size)
         # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
-        v, u = (
-            (torch.arange(math.ceil(side / STEP) + more, dtype=dtype, device="cpu") - more // 2) * STEP for side in size
-        )
+        counts = [math.ceil(side / STEP) + more for side in size]
+        v, u = ((torch.arange(count, dtype=dtype, device="cpu") - more // 2) * STEP for count in counts)
         nodes = torch.stack(torch.meshgrid(u, v + first, indexing="xy"))
         # (2 (w + h), 2): the pixels of the first and the last row, and of the first and the last column
         down += first
@@ -333,13 +337,15 @@ def _of_cells(cameras: Between, first: int, cells: Tensor, todo: Tensor) -> Tens
     Where what is mapped ends in one, its neighbours follow.
     """
     like = _like(cameras.target)
-    parts, count = [like.new_empty(2, 0, STEP, STEP)], 0
+    parts = [like.new_empty(2, 0, STEP, STEP)]
+    count = 0  # of the cells laid so far, whose numbers are their places
     done = torch.zeros_like(todo)
     offset = torch.arange(STEP, dtype=like.dtype, device=like.device)
     while bool(todo.any()):
         chosen, wanted = places(todo)
         i, j = chosen // todo.shape[2], chosen % todo.shape[2]
-        down, across = (i[..., None, None] * STEP + offset[:, None]), (j[..., None, None] * STEP + offset)
+        down = i[..., None, None] * STEP + offset[:, None]
+        across = j[..., None, None] * STEP + offset
         pixels = torch.stack(torch.broadcast_tensors(across, down + first), -1)  # (B, most, 8, 8, 2)
         positions, known = cameras.exact(pixels.flatten(2, 3))
         part = torch.where(known, positions.movedim(-1, 0), torch.nan)
