@@ -263,7 +263,8 @@ class CameraPair(GeometryModule):
         known: KeptPositions | None = self._kept.result
         if known is None or not known.calls or not isinstance(images, Tensor):
             return None
-        mode, padding = self.mode if mode is None else mode, self.padding_mode if padding is None else padding
+        mode = self.mode if mode is None else mode
+        padding = self.padding_mode if padding is None else padding
         tensors = self.tensors
         if not is_eager(images, *tensors) or images.requires_grad:
             return None
@@ -278,8 +279,8 @@ class CameraPair(GeometryModule):
 
     def warped(self, images: Tensor, sampler: Sampler, route: Route | None = None) -> Tensor:
         """Return the warped images (B, C, H', W') of checked images (B, C, H, W), whose route may be known."""
-        route, given = route or self.route(images), images
-        images = self.lengthened(images)
+        route = route or self.route(images)
+        given, images = images, self.lengthened(images)
         if route == "operator":
             options = self.tolerance, self.antialias, serving_all(self.padding_mode, sampler.padding_mode), sampler
             return compiled.warped(images, self.sampled, self.target, self.rotation, *options)
@@ -309,7 +310,8 @@ class CameraPair(GeometryModule):
 
     def positions(self, route: Route, padding: PaddingMode = "zeros") -> Positions:
         """Return the positions at which target pixels sample the source's image: kept ones unless they have a graph."""
-        is_traced, served, tolerance = in_jit_trace(), serving_all(self.padding_mode, padding), self.tolerance
+        is_traced, tolerance = in_jit_trace(), self.tolerance
+        served = serving_all(self.padding_mode, padding)
         if route == "graph":
             if is_traced:
                 raise RuntimeError(
@@ -381,7 +383,5 @@ class CameraPair(GeometryModule):
                 grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
                 return where._replace(grid=grid, mapped=mapped)
 
-            known = self._positions()
-            return (
-                own() if known.is_pinned else known.serving(f"constant {serving_all(self.padding_mode, padding)}", own)
-            )
+            known, served = self._positions(), serving_all(self.padding_mode, padding)
+            return own() if known.is_pinned else known.serving(f"constant {served}", own)
