@@ -208,7 +208,7 @@ class SampleCall:
         self._may_be_refused = [i for i, how in enumerate(hows) if how in ("boxes", "pose", "rotation vectors")]
 
     def _reader_of_images(self, job: structs.Job, like: Tensor, how: Sampler) -> Reader:
-        """Write into a job of C what all runs share, and return what writes the rest in each run; so do the next two."""
+        """Write into a job of C what all runs share; return what writes the rest in each run. So do the next two."""
         image = _as_images(like, self._batched)
         make_images = maker(image, self._count, self._sizes[1])
         result = make_images()
@@ -291,18 +291,18 @@ class SampleCall:
             run, counters = native.camtorch_lattices, self._lattices.counters
             if run_and_follow(run, call.lattices, self._count, counters, target, source):
                 return None
-        # all else: if one thread makes it, with the image; else its lattice, by which threads then share each image
+        # all else, again if a limit of a camera was missing; images too if one thread makes them, else their lattice
         one_thread = self._one_thread or threads == 1
         call.job_count, call.is_whole = self._images_of_call, one_thread
         while flags := native.camtorch_together(call):
             if flags & structs.LEFT_MOST:
                 return None
-            if self._follow(flags, source, target) == structs.LEFT_LABELS:
+            if self._follow(flags, source, target) == structs.LEFT_LABELS:  # nothing else is missing
                 for i in self._may_be_refused:
                     results[i] = None
                 break
         if not one_thread:
-            for job in self._jobs:
+            for job in self._jobs:  # threads share each image by its tiles
                 job.next = 0
                 spread(functools.partial(native.camtorch_sample, job), min(threads, self._most_tiles))
         return results
