@@ -311,7 +311,7 @@ class CameraPair(GeometryModule):
     def positions(self, route: Route, padding: PaddingMode = "zeros") -> Positions:
         """Return the positions at which target pixels sample the source's image: kept ones unless they have a graph."""
         is_traced, tolerance = in_jit_trace(), self.tolerance
-        served = serving_all(self.padding_mode, padding)
+        served = serving_all(self.padding_mode, padding)  # what is kept then serves calls of both
         if route == "graph":
             if is_traced:
                 raise RuntimeError(
