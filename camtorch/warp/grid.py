@@ -282,7 +282,7 @@ def _found_by_torch(
         if is_smooth:
             cells = torch.full((len(nodes), n, m), CELL_QUINTIC, dtype=torch.int32, device=nodes.device)
             return Lattice(nodes, cells, nodes.new_empty(2, 0, STEP, STEP), size)
-    # cubics where nodes show that they serve, or exact positions do
+    # cells of cubics: where the nodes show that these serve, or, in doubt, exact positions do
     narrow, rim = nodes.float(), mapped[:, count:]
     mapped = mapped[:, :count].unflatten(1, shape)
     mapped = mapped[:, 1:-1, 1:-1].contiguous() if looks_further else mapped
