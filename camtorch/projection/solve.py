@@ -1,4 +1,11 @@
-"""The inverse of a lens for the few points that a table and a few steps leave open: brackets and damped steps."""
+"""The inverse of a lens for the few points that a table and a few steps leave open: brackets and damped steps.
+
+`search` chooses a way, see `domain.InverseBy`. By radius and by stages the domain is a circle, and the solution is
+bracketed; in the plane, secants find a start for damped steps. `_Search` then checks where a solution's ray is seen.
+
+Each of M points has a `camera`, an index. A lens sends (a, b), of the chart's plane, to (u, v); its first stage sends
+it to (p, q), and the later stages that to (u, v).
+"""
 
 from __future__ import annotations
 
@@ -24,9 +31,10 @@ Searched = tuple[Tensor, Tensor, Tensor]
 
 _CLOSE_SHARE = 0.02  # of a point's distance from the centre: a start whose image is as near to it will do
 _SLOWEST_TURN = 0.05  # radians that an image turns by, for each by which its point turns: the least that secants assume
-_GIVE_UP = 1e-4  # of a step of Newton's method: shorter parts of it are not tried
+_LEAST_PART = 1e-4  # of a step of Newton's method: shorter parts of it are not tried
 _STAGE_STEPS = 12  # the first ones may take off no more than a third, see `domain._LEAST_SLOPE`
-_FIRST_STEPS, _LATE_STEPS = 6, 54  # late points lie next to a fold, or so far out that a prism dominates
+_FIRST_STEPS = 6  # of all points
+_LATE_STEPS = 54  # of the few that are left: next to a fold, or so far out that a prism dominates
 
 
 def search(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Searched:
@@ -49,14 +57,14 @@ def _search_exported(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Se
     """Run `search` for all points in the ways that cameras need, as a part of an exported program."""
 
     def by_stages() -> Searched:
-        first, within = _first_image_of_points(domain, camera, u, v)
-        a, b, there = _Search(domain, camera, is_circle=True)(u, v, first)
-        return a, b, there & within
+        first, reached = _invert_later_stages(domain, camera, u, v)
+        a, b, found = _Search(domain, camera, is_circle=True)(u, v, first)
+        return a, b, found & reached
 
     def in_plane() -> Searched:
         within = (u * u + v * v).sqrt() <= domain.extent.furthest[camera, azimuth(u, v)]
-        a, b, there = _Search(domain, camera, within=within)(u, v)
-        return a, b, there & within
+        a, b, found = _Search(domain, camera, within=within)(u, v)
+        return a, b, found & within
 
     if domain.inverse_by == "stages":
         return by_stages()
@@ -69,14 +77,15 @@ def _search_exported(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Se
 
 def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Searched:
     """Run `search` if only the first stage, a radial one, has a limit: the point that it must reach decides."""
-    (p, q), within = _first_image_of_points(domain, camera, u, v)
+    (p, q), reached = _invert_later_stages(domain, camera, u, v)
     alone = partial(_Search, domain, is_circle=True)
-    return _find_chosen(within, u, lambda some: alone(camera[some])(u[some], v[some], (p[some], q[some])))
+    return _find_chosen(reached, u, lambda some: alone(camera[some])(u[some], v[some], (p[some], q[some])))
 
 
-def _first_image_of_points(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Planes2, Tensor]:
-    """Return the points that the stages after the first one send to (u, v), and whether the first one reaches them."""
-    rest, table = present(domain.optics_of(camera)[1].rest, "a later stage"), present(domain.inverse, "a table")
+def _invert_later_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Planes2, Tensor]:
+    """Return the points (p, q) that the later stages send to (u, v), and whether the first one reaches them."""
+    rest = present(domain.optics_of(camera)[1].rest, "a later stage")
+    table = present(domain.inverse, "a table")
     p, q = rest.start(u, v)
     for _ in range(_STAGE_STEPS):
         at = rest.at(p, q)
@@ -108,21 +117,23 @@ class _Search:
     """The lenses of single points (M,), and the inverse by bracketing and damped steps."""
 
     def __init__(self, domain: Domain, camera: Tensor, *, is_circle: bool = False, within: Tensor | None = None):
-        """Take a domain, whose fold `is_circle` for every radial lens; a recorded search is for `within` (M,)."""
+        """Take a domain, which always `is_circle` if a lens is radial; a recorded search moves only points `within`."""
         self.domain, self.camera, self.within = domain, camera, within
         self.chart, self.lens = domain.optics_of(camera)
         self.is_circle = is_circle or self.lens.is_radial
 
     def __call__(self, u: Tensor, v: Tensor, first: Planes2 | None = None) -> Searched:
-        """Search; `first` is where the first stage must send the points, if the fold is a circle; by default (u, v)."""
+        """Search; if the domain is a circle, `first` is (p, q), by default (u, v)."""
         a, b = self.radial(*(first or (u, v))) if self.is_circle else self.planar(u, v)
         at = self.lens.at(a, b)
-        (x, y), jacobian = at.value, at.jacobian
+        x, y = at.value
+        ua, ub, va, vb = at.jacobian
         valid = self.contains(a, b)
-        stretch = torch.maximum(jacobian[0].abs() + jacobian[1].abs(), jacobian[2].abs() + jacobian[3].abs())
+        # an error of one eps in the solution moves its image by an eps of this
+        stretch = torch.maximum(ua.abs() + ub.abs(), va.abs() + vb.abs())
         stretch = stretch * torch.maximum(a.abs(), b.abs())
         for _ in range(2):  # to remove what rounding left
-            da, db, _ = newton_step(jacobian, u - x, v - y)
+            da, db, _ = newton_step(at.jacobian, u - x, v - y)
             a, b = torch.where(valid, a + da, 0.0), torch.where(valid, b + db, 0.0)
             x, y = self.lens(a, b)
         # next to a fold the polished solution may lie on its other side: the place where its ray is seen counts
@@ -172,15 +183,15 @@ class _Search:
         """
         enough = rounding(u, v) / 8
 
-        def moves(x: Tensor, y: Tensor, length: Tensor) -> Tensor:
-            active = (torch.maximum((u - x).abs(), (v - y).abs()) > enough) & (length > _GIVE_UP)
+        def moves(x: Tensor, y: Tensor, part: Tensor) -> Tensor:
+            active = (torch.maximum((u - x).abs(), (v - y).abs()) > enough) & (part > _LEAST_PART)
             return active if self.within is None else active & self.within
 
-        def step(active: Tensor, length: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        def step(active: Tensor, part: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
             a, b, x, y, ua, ub, va, vb = state
             jacobian = ua, ub, va, vb
             da, db, _ = newton_step(jacobian, u - x, v - y)
-            trial = a + length * da, b + length * db
+            trial = a + part * da, b + part * db
             at = self.lens.at(*trial)
             ahead = newton_step(jacobian, u - at.value[0], v - at.value[1])
             nearer = ahead[0] * ahead[0] + ahead[1] * ahead[1] < da * da + db * db
@@ -188,36 +199,42 @@ class _Search:
             good = active & nearer & self.contains(*trial, to_edge=False)
             new = *trial, *at.value, *at.jacobian
             state = tuple(torch.where(good, n, o) for n, o in zip(new, state, strict=True))
-            length = torch.where(good, (length * 4).clamp(max=1), length / 4)
-            return moves(state[2], state[3], length), length, *state
+            part = torch.where(good, (part * 4).clamp(max=1), part / 4)
+            return moves(state[2], state[3], part), part, *state
 
-        at, length = self.lens.at(a, b), torch.ones_like(u)
-        state = length, *torch.broadcast_tensors(a, b, *at.value, *at.jacobian)
-        active, _, a, b, *_ = repeat(step, moves(*at.value, length), state, steps)
+        at = self.lens.at(a, b)
+        whole = torch.ones_like(u)
+        state = whole, *torch.broadcast_tensors(a, b, *at.value, *at.jacobian)
+        active, _, a, b, *_ = repeat(step, moves(*at.value, whole), state, steps)
         return a, b, active
 
     def _start(self, u: Tensor, v: Tensor) -> Planes2:
         """Return the best of some points that the lens sends as far out as (u, v); secants find their azimuths."""
-        target, wanted = (u * u + v * v).sqrt(), torch.atan2(v, u)
+        target = (u * u + v * v).sqrt()
         extent = self.domain.extent
 
         def look(far: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-            a, b, best, angle, step, last_off = state
+            a, b, least_error, angle, step, last_off = state
+            # the point at this angle that the lens sends as far out as (u, v)
             c, s = torch.cos(angle), torch.sin(angle)
             rho = extent.start(self.camera, target, c, s)
-            x, y = self.lens(rho * c, rho * s)
+            trial_a, trial_b = rho * c, rho * s
+            x, y = self.lens(trial_a, trial_b)
+            # keep the best; stop close points, so that a result is the same in any batch
             error = (u - x) ** 2 + (v - y) ** 2
-            better = (error < best) & far  # stop close points, so that a result is the same in any batch
-            a, b, best = (torch.where(better, n, o) for n, o in ((rho * c, a), (rho * s, b), (error, best)))
-            far = far & (best > _CLOSE_SHARE**2 * target * target)
+            better = (error < least_error) & far
+            a, b = torch.where(better, trial_a, a), torch.where(better, trial_b, b)
+            least_error = torch.where(better, error, least_error)
+            far = far & (least_error > _CLOSE_SHARE**2 * target * target)
+            # turn by a secant, from how far the image turned with the last step
             off = torch.atan2(x * v - y * u, x * u + y * v)
             slope = torch.where(step != 0, (last_off - off) / torch.where(step != 0, step, 1.0), 1.0)
             step = (off / slope.clamp(_SLOWEST_TURN, 2.0)).clamp(-1.0, 1.0)
-            return far, a, b, best, angle + step, step, off
+            return far, a, b, least_error, angle + step, step, off
 
         far = torch.ones_like(u, dtype=torch.bool) if self.within is None else self.within
         zero = torch.zeros_like(u)
-        _, a, b, *_ = repeat(look, far, (zero, zero, target * target, wanted, zero, zero), 6)
+        _, a, b, *_ = repeat(look, far, (zero, zero, target * target, torch.atan2(v, u), zero, zero), 6)
         return a, b
 
 
