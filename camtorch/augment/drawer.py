@@ -16,7 +16,7 @@ from camtorch.augment.change import LazyWarp, Part
 from camtorch.augment.devices import twin_of
 from camtorch.augment.filling import enough, scaled, tell_of_narrow_images
 from camtorch.augment.jitter import jittered
-from camtorch.augment.native_draws import Start, Wanted
+from camtorch.augment.native_draws import DRAWN_KINDS, Start, Wanted, too_wide
 from camtorch.augment.presets import REAL, as_like
 from camtorch.augment.ranges import Draw, Range, RangeLike, as_range
 from camtorch.cameras.camera import Camera
@@ -24,7 +24,6 @@ from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_numbers, hold_numbers, known_false, with_derivatives_of
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.models import KannalaBrandt, Pinhole
-from camtorch.native.structs import AMOUNTS
 from camtorch.optics.radial_inverse import precise
 from camtorch.poses.rotations import mount_elements
 from camtorch.rays.lattices import field_of_view
@@ -43,10 +42,10 @@ _LIMITS: dict[str, dict[str, Any]] = {
     "lens": {},
     "fov": {"least": _TINY, "most": 360},
     "focal": {"least": _TINY, "most": _HUGE, "around": 1},
-    "centre": {"least": -1, "most": 1, "size": 2},
-    "distortion": {"least": -1, "most": 1, "size": AMOUNTS},
+    "centre": {"least": -1, "most": 1, "size": DRAWN_KINDS["centre"].size},
+    "distortion": {"least": -1, "most": 1, "size": DRAWN_KINDS["distortion"].size},
     "crop": {"least": _TINY, "most": 1},
-    "place": {"size": 2},
+    "place": {"size": DRAWN_KINDS["place"].size},
     "chromatic": {"least": -0.5, "most": 0.5, "size": 2},
     "vignetting": {"least": 0, "most": 1},
     "cos4": {"least": -2, "most": 2},
@@ -347,10 +346,7 @@ def _as_wide(base: Camera, sized: Tensor, fov: Tensor, width: int, owner: str) -
         rays = rays.expand(*broadcast_shapes(rays.shape, (*base.batch_shape, 2, 3)))
     pixels, valid = base.project(rays)
     if known_false(valid):
-        raise ValueError(
-            f"{owner}: fov must be within the reach of a {base.key} lens of these coefficients; got "
-            f"{float(fov.max()):g} degrees"
-        )
+        raise too_wide(owner, base, float(fov.max()))
     ratio = width / (pixels[..., 1, 0] - pixels[..., 0, 0])
     focal = precise(base.intrinsics)[..., :2] * ratio.unsqueeze(-1)
     return torch.cat(torch.broadcast_tensors(focal, sized[..., 2:]), -1)
