@@ -25,10 +25,9 @@ from camtorch.warp.at_once import Label, MovedField, SampleCall, call_for, nativ
 from camtorch.warp.boxes import along_edges, around, corners_of, in_order
 from camtorch.warp.options import Options, Sampler
 
+# Labels of a single sample that one call of C moves beside pixels: where it may be mirrored, and where it is not
 _LABELS_OF_MIRRORS: Sequence[Label] = "boxes", "rays"
-"""Labels of a single sample that one call of C moves beside pixels where it is mirrored."""
 _LABELS_OF_TURNS: Sequence[Label] = *_LABELS_OF_MIRRORS, "columns", "pose", "rotation vectors"
-"""Labels that it moves where nothing is mirrored."""
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
 
 
@@ -37,12 +36,11 @@ def form_of(
 ) -> tuple[Any, ...] | None:
     """Return all that a plan depends on, by which it is kept; None if it cannot be kept.
 
-    A plan cannot be kept if the camera is a `Mixed`, tensors are traced, or a field is, for example, a list.
-
     revision: that of the transform, which changes with its options.
     """
     if not isinstance(camera, Camera) or camera.is_mixed:
         return None
+    # Of tensors all but the numbers counts, of other values the type; what a list or a dict holds is not looked at
     tensors: list[Tensor] = []
     values: list[Any] = []
     for name, value in sample.items():
@@ -53,13 +51,14 @@ def form_of(
             values += name, type(value)
         else:
             return None
+    # If tensors learn or are elsewhere, the plan is another, without a call of C; of traced calls none is kept
     is_free = are_free(*tensors)
     if not is_free and not are_free():
         return None
+    # Each thread keeps plans of its own, as calls of C hold memory that one thread writes
+    state = revision, get_ident(), is_free
     intrinsics, distortion = camera.intrinsics, camera.distortion
     numbers = intrinsics.shape, intrinsics.dtype, intrinsics.device, distortion.shape
-    # each thread keeps plans of its own, as calls of C hold memory that one thread writes
-    state = revision, get_ident(), is_free
     return *state, type(camera), camera.image_size, *numbers, type(sample), *values, *fields.items()
 
 
@@ -88,10 +87,12 @@ class SamplePlan:
         """
         part, calls = change.parts[0], self.calls
         moves = part.moves
+        # One call moves all rows by one warp, and records nothing
         if calls is None or moves is None or part.rows is not None or change.gate is not None or not self.count:
             return {}
         if not native_available():
             return self._pixels_at_once(part, values)
+        # Images whose colours or light change move on their own; of a `Warp` only images and pixels move here
         source: Native | None
         target: Native | None
         labels: Sequence[Label] = ()
@@ -103,20 +104,22 @@ class SamplePlan:
             return {}
         else:
             (source, target, rotation), size = natives, moves.target.size_for("Warp")
+        # C lacks models of cameras, and takes one for each row
         if source is None or target is None:
             return {}
         if max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != self.count:
             return {}
-        # all that a call of C depends on, beside the form
+        # The call is kept by all that it depends on, beside the form
         settings = size, source.dtype, labels, thread_count(), *moves.options.values()
         new = functools.partial(self._new_call, values, part.camera, size, source.dtype, moves.options, labels)
         names, call = calls((), settings, new)
         if call is None or (moved := call(source, target, rotation, [*map(values.__getitem__, names)])) is None:
             return {}
+        # Pixels and boxes are computed in the dtype of the cameras, and come out in their own
         results = dict[str, MovedField]()
         for name, result in zip(names, moved, strict=True):
             if result is not None:
-                rows, valid = result  # pixels and boxes are computed in the dtype of the cameras
+                rows, valid = result
                 results[name] = _in_range(rows, dtype) if (dtype := values[name].dtype) != rows.dtype else rows, valid
         return results
 
@@ -220,9 +223,8 @@ def move(change: Change, kind: str, value: Tensor, options: Mapping[str, float])
     if lead := value.shape[1 : value.ndim - KINDS[kind].most_dims]:
         frames = change._with_parts([replace(part, rows=None) for part in change.parts], [0] * math.prod(lead))
         result, valid = move(frames, kind, value.flatten(0, len(lead)), options)
-        return result.reshape(1, *lead, *result.shape[1:]), valid if valid is None else valid.reshape(
-            1, *lead, *valid.shape[1:]
-        )
+        valid = None if valid is None else valid.reshape(1, *lead, *valid.shape[1:])
+        return result.reshape(1, *lead, *result.shape[1:]), valid
     result = KINDS[kind].move(change, value, options)
     result, valid = result if isinstance(result, tuple) else (result, None)
     # geometry is computed in float32 at least; what came in half precision goes out in it
