@@ -97,11 +97,12 @@ class CameraDrawer(Augmentation):
         **options: Unpack[EditOptions],
     ):
         super().__init__(min_filled=min_filled, **options)
-        fov = given.get("fov")
-        self.fov = "source" if isinstance(fov, str) and fov == "source" else None
         self._memo = Kept(8)
         self.image_size: tuple[int, int] | None = as_image_size(image_size, self._name)
         self._is_real = isinstance(like, str) and like == REAL
+        fov = given.get("fov")
+        self.fov = "source" if isinstance(fov, str) and fov == "source" else None
+        # The ranges by name, of which some follow from others
         values = {**given, "chromatic": chromatic, "vignetting": vignetting, "cos4": cos4}
         for name in _AUTO:
             if isinstance(values.get(name), str) and values[name] == "auto":
@@ -119,8 +120,9 @@ class CameraDrawer(Augmentation):
                 self.ranges[name] = as_range(value, name, self._name, **limit)
         if "fov" in self.ranges:
             check_degrees(self.ranges["fov"].low, fov, self._name)
+        # Real lenses are not made as wide as a drawn angle, but drawn among those that are as wide
         real = self.ranges.pop("fov", None) if self._is_real else None
-        self._among = None if real is None else (real.low, real.high)  # as states of 0.4 name the fov of real lenses
+        self._among = None if real is None else (real.low, real.high)  # a name in states of 0.4
         self.like = None if self._is_real else like  # last, as setting it reads `fov` and `ranges`
 
     @property
@@ -138,11 +140,14 @@ class CameraDrawer(Augmentation):
                 got = f"one that was made with 'real'. Make a new {self._name}"
                 raise ValueError(f"{self._name}: like must stay None in {got}; got {given!r:.60}")
             if value is not None and value.image_size is None and self.fov is None and "fov" not in self.ranges:
-                raise ValueError(
-                    f"{self._name}: like must have an image_size, or fov be given; got like={given!r}. Pass fov=(low, "
-                    "high)"
-                )
+                wanted = "have an image_size, or fov be given"
+                raise ValueError(f"{self._name}: like must {wanted}; got like={given!r}. Pass fov=(low, high)")
         super().__setattr__(name, value)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        if "rates" in state["ranges"]:
+            raise ValueError(f"{type(self).__name__}: the saved augmentation draws a rolling shutter. {LEFT}")
+        super().__setstate__(state)
 
     @property
     def _keeps_formulas(self) -> bool:
@@ -151,15 +156,59 @@ class CameraDrawer(Augmentation):
 
     drawn_on_host = _keeps_formulas  # the formulas take numbers alone
 
-    def _like_for(self, source: Camera) -> Camera | None:
-        """Return `like`, on the CPU if the source is there and its numbers are known; None without `like`."""
-        like = self.like
-        return like if like is None or not source.intrinsics.is_cpu else twin_of(like) or like
+    def _part(self, source: Camera, draw: Draw) -> Part:
+        values = self._values_for(source, draw)
+        made = self._lazy_warp(source, values)
+        if made is None:
+            return self._part_by_torch(source, values)
+        if self.min_filled and (min(made.filled, default=1) < self.min_filled or max(made.zooms, default=1) > 1):
+            self._tell_of(source, lambda: made.target, torch.tensor(made.zooms), torch.tensor(made.filled))
+        may_stay_lazy = made.target_native is not None and self.options["tolerance"] and not self.options["antialias"]
+        if may_stay_lazy and self.beside_the_camera.isdisjoint(self.ranges):
+            return Part(source, made)  # of numbers, which become a `Warp` at first use
+        return self._part_between(source, made.target, made.rotation, values)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        if "rates" in state["ranges"]:
-            raise ValueError(f"{type(self).__name__}: the saved augmentation draws a rolling shutter. {LEFT}")
-        super().__setstate__(state)
+    def _lazy_warp(self, source: Camera, values: Mapping[str, Any]) -> LazyWarp | None:
+        """Return the warp of a draw by native code; None if something is recorded, or that lacks a model."""
+        like = None if self.like is None else self._like_for(source)
+        tensors = (source.intrinsics, source.distortion) if like is None else (*source.tensors, *like.tensors)
+        # floats and arrays are drawn only if nothing is recorded; with no range at all, ask
+        first = next(iter(values.values()), None)
+        is_recorded = isinstance(first, Tensor) or (first is None and not are_numbers())
+        if is_recorded or not hold_numbers(tensors):
+            return None
+        if self._is_real:  # each draw has a lens of its own
+            start = self._start(source, values)
+        else:
+            # all else that new cameras depend on
+            sizes = source.image_size, None if like is None else like.image_size
+            key = "start", type(source), *sizes, self._calls.revision, self.ranges.get("fov"), self.min_filled, *values
+            known = self._memo.entry(tensors, key)
+            start = self._memo(tensors, key, partial(self._start, source, values)) if known is None else known.result
+        if start is None:
+            return None
+        return start.warp(values, source if like is None and not self._is_real else start.base, self._warp_options)
+
+    def _start(self, source: Camera, values: Mapping[str, Any]) -> Start | None:
+        """Return what native code starts from for values of these names; None if it lacks a range, or a model."""
+        if not self._keeps_formulas:
+            return None
+        names = values.keys() - self.beside_the_camera - {"lens"}
+        base, sized, covered_radius = self._lens_for(source.detach().clone(), values.get("lens"))
+        jitters, size = "distortion" in values and base.distortion.shape[-1] > 0, self._size_of(source)
+        nominal = self._nominal(base, sized, size, values) if jitters else None
+        return Start.of(Wanted(source, base, sized, covered_radius, size, names, nominal, self.min_filled, self._name))
+
+    def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
+        if not self._keeps_formulas:
+            return super()._new_camera(source, values)
+        for name, one in self.ranges.items():  # which may have been set since
+            if name in _LIMITS and one.size != (size := _LIMITS[name].get("size")):
+                wanted = "Range(low, high)" if size is None else f"Range(low, high, {size})"
+                raise ValueError(f"{self._name}: the range {name!r} must be {wanted}; got {one!r}")
+        example = precise(source.intrinsics.detach())
+        kind: dict[str, Any] = {"dtype": example.dtype, "device": example.device}  # as_tensor makes float32 of floats
+        return self.new_camera(source, {name: torch.as_tensor(value, **kind) for name, value in values.items()})
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """Return the new camera and its turn, by formulas of torch; see `Augmentation.new_camera`."""
@@ -195,58 +244,54 @@ class CameraDrawer(Augmentation):
         elements = mount_elements([angle.cos() for angle in angles], [angle.sin() for angle in angles])
         return target, _joined(elements, source.intrinsics).unflatten(-1, (3, 3))
 
-    def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
-        if not self._keeps_formulas:
-            return super()._new_camera(source, values)
-        for name, one in self.ranges.items():  # which may have been set since
-            if name in _LIMITS and one.size != (size := _LIMITS[name].get("size")):
-                wanted = "Range(low, high)" if size is None else f"Range(low, high, {size})"
-                raise ValueError(f"{self._name}: the range {name!r} must be {wanted}; got {one!r}")
-        example = precise(source.intrinsics.detach())
-        kind: dict[str, Any] = {"dtype": example.dtype, "device": example.device}  # as_tensor makes float32 of floats
-        return self.new_camera(source, {name: torch.as_tensor(value, **kind) for name, value in values.items()})
+    def _lens_for(self, source: Camera, share: Any) -> tuple[Camera, Tensor, Tensor | None]:
+        """Return the camera whose lens new cameras have, its intrinsics (*B, 4) for their size, and any covered radius.
 
-    def _part(self, source: Camera, draw: Draw) -> Part:
-        values = self._values_for(source, draw)
-        made = self._lazy_warp(source, values)
-        if made is None:
-            return self._part_by_torch(source, values)
-        if self.min_filled and (min(made.filled, default=1) < self.min_filled or max(made.zooms, default=1) > 1):
-            self._tell_of(source, lambda: made.target, torch.tensor(made.zooms), torch.tensor(made.filled))
-        may_stay_lazy = made.target_native is not None and self.options["tolerance"] and not self.options["antialias"]
-        if may_stay_lazy and self.beside_the_camera.isdisjoint(self.ranges):
-            return Part(source, made)
-        return self._part_between(source, made.target, made.rotation, values)
+        share: of "real" lenses, which one. Only these have the radius (*B,): `reach` of `lenses.drawing.Lenses`.
+        """
+        size, like, covered_radius = self._size_of(source), self._like_for(source), None
+        base = source if like is None else like
+        dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
+        if self._is_real:
+            lens = drawn(torch.as_tensor(share, dtype=dtype, device=device), size, self._among)
+            base = remade(_REAL_LENS, intrinsics=lens.intrinsics, distortion=lens.distortion, image_size=size)
+            covered_radius = lens.reach
+        if any(t.dtype != dtype or t.device != device for t in base.tensors):
+            base = base.each(lambda t: t.to(device, dtype))
+        sized = _sized(base, size) if self.fov is None else precise(self._from_source(source, base, size))
+        return base, sized, covered_radius
 
-    def _lazy_warp(self, source: Camera, values: Mapping[str, Any]) -> LazyWarp | None:
-        """Return the warp of a draw by native code; None if something is recorded, or that lacks a model."""
-        like = None if self.like is None else self._like_for(source)
-        tensors = (source.intrinsics, source.distortion) if like is None else (*source.tensors, *like.tensors)
-        # floats and arrays are drawn only if nothing is recorded; with no range at all, ask
-        first = next(iter(values.values()), None)
-        if isinstance(first, Tensor) or (first is None and not are_numbers()) or not hold_numbers(tensors):
-            return None
-        if self._is_real:  # each draw has a lens of its own
-            start = self._start(source, values)
-        else:
-            # all else that new cameras depend on
-            sizes = source.image_size, None if like is None else like.image_size
-            key = "start", type(source), *sizes, self._calls.revision, self.ranges.get("fov"), self.min_filled, *values
-            known = self._memo.entry(tensors, key)
-            start = self._memo(tensors, key, partial(self._start, source, values)) if known is None else known.result
-        if start is None:
-            return None
-        return start.warp(values, source if like is None and not self._is_real else start.base, self._warp_options)
+    def _from_source(self, source: Camera, base: Camera, size: tuple[int, int]) -> Tensor:
+        """Return intrinsics (*B, 4) of the lens, at most as wide as its like, whose images the source fills."""
 
-    def _start(self, source: Camera, values: Mapping[str, Any]) -> Start | None:
-        """Return what native code starts from for values of these names; None if it lacks a range, or a model."""
-        if not self._keeps_formulas:
-            return None
-        names = values.keys() - self.beside_the_camera - {"lens"}
-        base, sized, covered_radius = self._lens_for(source.detach().clone(), values.get("lens"))
-        jitters, size = "distortion" in values and base.distortion.shape[-1] > 0, self._size_of(source)
-        nominal = self._nominal(base, sized, size, values) if jitters else None
-        return Start.of(Wanted(source, base, sized, covered_radius, size, names, nominal, self.min_filled, self._name))
+        def narrowed() -> Tensor:
+            sized = _sized(base, size)
+            if base.image_size is None:
+                sized = _as_wide(base, sized, torch.rad2deg(field_of_view(source)[..., 0]), size[1], self._name)
+            whole = remade(base, intrinsics=sized.to(base.intrinsics.dtype), image_size=size)
+            return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
+
+        key = "source", type(source), source.image_size, type(base), base.image_size, size
+        return self._memo(source.tensors + base.tensors, key, narrowed)
+
+    def _nominal(self, base: Camera, sized: Tensor, size: tuple[int, int], values: Mapping[str, Any]) -> Tensor:
+        """Return intrinsics (*B, 4) without a graph, with the field of view in the middle of the range."""
+        if "fov" not in values:
+            return sized.detach().to(base.intrinsics.dtype)
+
+        def made() -> Tensor:
+            middle = precise(base.intrinsics).new_tensor(self.ranges["fov"].middle)
+            return _as_wide(base, sized, middle, size[1], self._name).detach().to(base.intrinsics.dtype)
+
+        return self._memo(base.tensors, ("nominal", type(base), base.image_size, size, self.ranges["fov"]), made)
+
+    def _like_for(self, source: Camera) -> Camera | None:
+        """Return `like`, on the CPU if the source is there and its numbers are known; None without `like`."""
+        like = self.like
+        return like if like is None or not source.intrinsics.is_cpu else twin_of(like) or like
+
+    def _size_of(self, source: Camera) -> tuple[int, int]:
+        return self.image_size or source.size_for(self._name)
 
     def _part_between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
         """Return the part with the effect of the lens on colours and light."""
@@ -267,50 +312,6 @@ class CameraDrawer(Augmentation):
         least = self._among[0] if self._among else self.ranges["fov"].low if "fov" in self.ranges else None
         if least is not None:
             tell_of_narrow_images(self._name, least, self.min_filled or 0.0, source, target, factor, found)
-
-    def _size_of(self, source: Camera) -> tuple[int, int]:
-        return self.image_size or source.size_for(self._name)
-
-    def _lens_for(self, source: Camera, share: Any) -> tuple[Camera, Tensor, Tensor | None]:
-        """Return the camera whose lens new cameras have, its intrinsics (*B, 4) for their size, and any covered radius.
-
-        share: of "real" lenses, which one. Only these have the radius (*B,): `reach` of `lenses.drawing.Lenses`.
-        """
-        size, like, covered_radius = self._size_of(source), self._like_for(source), None
-        base = source if like is None else like
-        dtype, device = torch.promote_types(source.intrinsics.dtype, torch.float32), source.intrinsics.device
-        if self._is_real:
-            lens = drawn(torch.as_tensor(share, dtype=dtype, device=device), size, self._among)
-            base = remade(_REAL_LENS, intrinsics=lens.intrinsics, distortion=lens.distortion, image_size=size)
-            covered_radius = lens.reach
-        if any(t.dtype != dtype or t.device != device for t in base.tensors):
-            base = base.each(lambda t: t.to(device, dtype))
-        sized = _sized(base, size) if self.fov is None else precise(self._from_source(source, base, size))
-        return base, sized, covered_radius
-
-    def _nominal(self, base: Camera, sized: Tensor, size: tuple[int, int], values: Mapping[str, Any]) -> Tensor:
-        """Return intrinsics (*B, 4) without a graph, with the field of view in the middle of the range."""
-        if "fov" not in values:
-            return sized.detach().to(base.intrinsics.dtype)
-
-        def made() -> Tensor:
-            middle = precise(base.intrinsics).new_tensor(self.ranges["fov"].middle)
-            return _as_wide(base, sized, middle, size[1], self._name).detach().to(base.intrinsics.dtype)
-
-        return self._memo(base.tensors, ("nominal", type(base), base.image_size, size, self.ranges["fov"]), made)
-
-    def _from_source(self, source: Camera, base: Camera, size: tuple[int, int]) -> Tensor:
-        """Return intrinsics (*B, 4) of the lens, at most as wide as its like, whose images the source fills."""
-
-        def narrowed() -> Tensor:
-            sized = _sized(base, size)
-            if base.image_size is None:
-                sized = _as_wide(base, sized, torch.rad2deg(field_of_view(source)[..., 0]), size[1], self._name)
-            whole = remade(base, intrinsics=sized.to(base.intrinsics.dtype), image_size=size)
-            return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
-
-        key = "source", type(source), source.image_size, type(base), base.image_size, size
-        return self._memo(source.tensors + base.tensors, key, narrowed)
 
 
 def _joined(numbers: Sequence[Tensor], example: Tensor) -> Tensor:
