@@ -42,10 +42,10 @@ _LIMITS: dict[str, dict[str, Any]] = {
     "lens": {},
     "fov": {"least": _TINY, "most": 360},
     "focal": {"least": _TINY, "most": _HUGE, "around": 1},
-    "centre": {"least": -1, "most": 1, "size": DRAWN_KINDS["centre"].size},
-    "distortion": {"least": -1, "most": 1, "size": DRAWN_KINDS["distortion"].size},
+    "centre": {"least": -1, "most": 1, "size": DRAWN_KINDS["centre"][1]},
+    "distortion": {"least": -1, "most": 1, "size": DRAWN_KINDS["distortion"][1]},
     "crop": {"least": _TINY, "most": 1},
-    "place": {"size": DRAWN_KINDS["place"].size},
+    "place": {"size": DRAWN_KINDS["place"][1]},
     "chromatic": {"least": -0.5, "most": 0.5, "size": 2},
     "vignetting": {"least": 0, "most": 1},
     "cos4": {"least": -2, "most": 2},
@@ -174,8 +174,7 @@ class CameraDrawer(Augmentation):
         tensors = (source.intrinsics, source.distortion) if like is None else (*source.tensors, *like.tensors)
         # floats and arrays are drawn only if nothing is recorded; with no range at all, ask
         first = next(iter(values.values()), None)
-        is_recorded = isinstance(first, Tensor) or (first is None and not are_numbers())
-        if is_recorded or not hold_numbers(tensors):
+        if isinstance(first, Tensor) or (first is None and not are_numbers()) or not hold_numbers(tensors):
             return None
         if self._is_real:  # each draw has a lens of its own
             start = self._start(source, values)

@@ -31,24 +31,18 @@ from camtorch.values.arguments import present
 from camtorch.values.module import model_of, remade
 from camtorch.warp.options import Options
 
-
-class _Kind(NamedTuple):
-    code: int  # of C
-    size: int = 1  # how many numbers a value is
-
-
-# Name of a range -> the kind of its values
+# Name of a range -> the code that C has for its values, and how many numbers each is
 DRAWN_KINDS = {
-    "yaw": _Kind(structs.YAW),
-    "pitch": _Kind(structs.PITCH),
-    "roll": _Kind(structs.ROLL),
-    "zoom": _Kind(structs.ZOOM),
-    "fov": _Kind(structs.WIDTH),
-    "focal": _Kind(structs.FOCAL),
-    "centre": _Kind(structs.CENTRE, 2),
-    "distortion": _Kind(structs.DISTORTION, structs.AMOUNTS),
-    "crop": _Kind(structs.CROP),
-    "place": _Kind(structs.PLACE, 2),
+    "yaw": (structs.YAW, 1),
+    "pitch": (structs.PITCH, 1),
+    "roll": (structs.ROLL, 1),
+    "zoom": (structs.ZOOM, 1),
+    "fov": (structs.WIDTH, 1),
+    "focal": (structs.FOCAL, 1),
+    "centre": (structs.CENTRE, 2),
+    "distortion": (structs.DISTORTION, structs.AMOUNTS),
+    "crop": (structs.CROP, 1),
+    "place": (structs.PLACE, 2),
 }
 _TURNS = {"yaw", "pitch", "roll"}
 
@@ -92,10 +86,10 @@ class Start:
             camera_rows(camera, *[t.expand(*camera.batch_shape, t.shape[-1]) for t in camera.tensors])
             for camera in (source, base)
         )
+        if of_source.native is None or of_base.native is None:
+            return None
         are_usable = of_source.usable is None and of_base.usable is None  # else flags say which numbers are no camera's
         if not are_usable or {t.dtype for t in source.tensors} != {base.intrinsics.dtype}:
-            return None
-        if of_source.native is None or of_base.native is None:
             return None
         return cls(wanted, of_source.native, of_base.native)
 
@@ -107,11 +101,10 @@ class Start:
         self._is_flat = source.turn_axis is None and base.turn_axis is None
         self._batch = tuple(wanted.sized.shape[:-1]) or base.batch_shape  # (B,) if each camera has a lens of its own
         self._distortion = base.distortion.detach()
-        count = self._distortion.shape[-1]
-        call = self._call = structs.Draws(cameras=1, count=count, height=size[0], width=size[1])
+        call = self._call = structs.Draws(count=self._distortion.shape[-1], height=size[0], width=size[1])
         # The base: new cameras have its lens, which is copied with its table, for those that unproject
         base_native.add_table()
-        call.base, call.made, call.made.usable, call.made.cameras = base_native.pointer, base_native.struct, None, 1
+        call.base, call.made, call.made.usable = base_native.pointer, base_native.struct, None
         call.is_each, call.sized = bool(self._batch), self._keep(wanted.sized)
         call.reach = None if wanted.covered_radius is None else self._keep(wanted.covered_radius.double())
         # The source: C looks at it only where new images have to be filled
@@ -124,11 +117,11 @@ class Start:
         self._names: list[str] = [name for name in DRAWN_KINDS if name in wanted.names]
         self._drawn = 0  # how many numbers are drawn for a camera
         call.first[:] = [-1] * structs.DRAWN_KINDS
-        for name in self._names:
-            call.first[DRAWN_KINDS[name].code] = self._drawn
-            self._drawn += DRAWN_KINDS[name].size
+        for code, size_of_value in map(DRAWN_KINDS.__getitem__, self._names):
+            call.first[code] = self._drawn
+            self._drawn += size_of_value
         # What C writes: for a camera 4 intrinsics, a rotation and coefficients; a lens that it makes takes more
-        self._room = 4 + 9 + count  # how many numbers
+        self._room = 4 + 9 + call.count  # how many numbers
         self._types = (c_float, np.float32) if base_native.dtype == torch.float32 else (c_double, np.float64)
         self._needs_limits = False  # whether new lenses of an earlier call needed limits on azimuths
         self._coefficients: np.ndarray[Any, Any] = self._distortion.numpy()  # of new cameras, unless they are jittered
@@ -169,8 +162,7 @@ class Start:
         rows = batch[0] if batch else 1
         room = _array(number, rows * self._room)()
         call.values, call.room = addressof(packed), addressof(room)
-        if rows != 1:  # as they are one at first
-            call.cameras = call.made.cameras = rows
+        call.cameras = call.made.cameras = rows
         if call.share:
             shares = _array(c_double, 2 * rows)()  # the factors, and what is filled
             call.factors = addressof(shares)
@@ -223,9 +215,8 @@ class Start:
     def _check_count(self, count: int, rows: int) -> None:
         """Raise a ValueError unless so many numbers are what cameras are made of, as C reads all of them."""
         if count != self._drawn * rows:
-            several = [(name, kind.size) for name, kind in DRAWN_KINDS.items() if kind.size > 1]
-            sizes = ", ".join(f"{name} as Range(low, high, {size})" for name, size in several)
-            wanted = f"{self._drawn} numbers for a sample, {sizes}, and others as Range(low, high)"
+            several = [f"{name} as Range(low, high, {size})" for name, (_, size) in DRAWN_KINDS.items() if size > 1]
+            wanted = f"{self._drawn} numbers for a sample, {', '.join(several)}, and others as Range(low, high)"
             raise ValueError(f"{self._owner}: ranges must draw {wanted}; got {count} for {rows} samples")
 
     def _candidates(self, values: Mapping[str, Any], call: structs.Draws) -> Native:
@@ -248,12 +239,11 @@ class Start:
         """Compute what C lacked, by the flags `left`."""
         if left & structs.TOO_WIDE:
             raise too_wide(self._owner, self.base, np.max(values["fov"]))
-        if left & structs.LEFT_LENS:
-            if candidates is None:
-                self._needs_limits = True
-                self._add_limits(call)
-            else:
-                candidates.follow()
+        if left & structs.LEFT_LENS and candidates is not None:
+            candidates.follow()
+        elif left & structs.LEFT_LENS:
+            self._needs_limits = True
+            self._add_limits(call)
         if left & structs.LEFT_BASE:
             self._base_native.follow()
         if left & structs.LEFT_SOURCE:
