@@ -34,10 +34,7 @@ _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
 def form_of(
     sample: Mapping[str, Any], camera: object, fields: Mapping[str, str], revision: object
 ) -> tuple[Any, ...] | None:
-    """Return all that a plan depends on, by which it is kept; None if it cannot be kept.
-
-    revision: that of the transform, which changes with its options.
-    """
+    """Return all that a plan depends on, by which it is kept; None if it cannot be. `revision`: of the options."""
     if not isinstance(camera, Camera) or camera.is_mixed:
         return None
     # Of tensors all but the numbers counts, of other values the type; what a list or a dict holds is not looked at
