@@ -1,4 +1,8 @@
-"""Pixels to rays: the inverse of the lens and why a pixel is invalid, as torch records it, and in native code."""
+"""Pixels to rays: the inverse of the lens and why a pixel is invalid, as torch records it, and in native code.
+
+As torch records it, a pixel becomes a target on the sensor. `invert` finds the point (a, b) of the chart's plane that
+the lens sends there, and `search` those that it leaves open. `attach` gives them derivatives, and the chart makes rays.
+"""
 
 from __future__ import annotations
 
@@ -109,6 +113,17 @@ def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Found:
     return Found(a, b, torch.minimum(converged, reciprocal.abs()), torch.ones_like(a))
 
 
+def _search_recorded(domain: Domain, target: Planes2, found: Found) -> Found:
+    """Run `search` for points that are left open, as a part of an exported program."""
+    if all(stage.is_affine for stage in domain.lens.stages):  # no point is open then
+        return found
+    camera, point = (~(found.solved > 0) & (found.possible > 0)).nonzero(as_tuple=True)
+    a, b, there = search(domain, camera, *(w[camera, point] for w in target))
+    results = a, b, torch.where(there, 1.0, -1.0).to(a.dtype)
+    a, b, solved = (plane.index_put((camera, point), w) for plane, w in zip(found[:3], results, strict=True))
+    return Found(a, b, solved, found.possible)
+
+
 def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes2:
     """Give a graph-free solution of lens(solution) = target its derivatives, exact up to the order of `steps`.
 
@@ -118,17 +133,17 @@ def attach(lens: Lens, solution: Planes2, target: Planes2, steps: int) -> Planes
     """
     a, b = solution
     with torch.no_grad():
-        xa, xb, ya, yb = [w.detach() for w in lens.at(a, b).jacobian]
+        ua, ub, va, vb = [w.detach() for w in lens.at(a, b).jacobian]
     for _ in range(steps):
         x, y = lens(a, b)
-        da, db, _ = newton_step((xa, xb, ya, yb), target[0] - x, target[1] - y)
+        da, db, _ = newton_step((ua, ub, va, vb), target[0] - x, target[1] - y)
         # the value does not change: next to a fold, a step by the remaining rounding would lead across
         a, b = a + (da - da.detach()), b + (db - db.detach())
     return a, b
 
 
 def _to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...], looks: bool) -> tuple[Planes2, Tensor | None]:
-    """Return points (p, q) of the sensor in focal lengths, and a mask: 0 for NaN and far pixels, put at the centre."""
+    """Return targets (p, q) on the sensor, in focal lengths, and a mask: 0 for NaN and far pixels, at its centre."""
     focal_x, focal_y, centre_x, centre_y = intrinsics
     p, q = (u - centre_x) / focal_x, (v - centre_y) / focal_y
     far = torch.maximum(p.detach().abs(), q.detach().abs())
@@ -152,9 +167,9 @@ def _formula(
     order = order_of(order, pixels, intrinsics, distortion)
     u, v = to_planes(pixels)
     # the solution has no graph; `attach` gives it derivatives
-    target, mask = _to_target(u.detach(), v.detach(), columns(traced.intrinsics.detach()), looks)
+    (p, q), mask = _to_target(u.detach(), v.detach(), columns(traced.intrinsics.detach()), looks)
     mask = both(mask, traced.usable)
-    a, b = p, q = replace(mask, target[0], 0.0), replace(mask, target[1], 0.0)
+    p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
     if domain.lens.stages:
         found = invert(domain, p, q)
         if domain.is_constant:
@@ -166,19 +181,20 @@ def _formula(
             found = Found(a, b, solved, found.possible)
         a, b, margin = found.a, found.b, found.solved
     else:
-        margin = domain.chart.on_plane(p, q)
+        a, b, margin = p, q, domain.chart.on_plane(p, q)
     solved = to_mask(margin, looks)
     seen = domain.chart.seen(replace(solved, a, 0.0), replace(solved, b, 0.0))
     solved = solved if seen is None else both(solved, to_mask(seen, looks))
-    mask, a, b = both(mask, solved), replace(solved, a, 0.0), replace(solved, b, 0.0)
+    mask = both(mask, solved)
+    a, b = replace(solved, a, 0.0), replace(solved, b, 0.0)
 
     def evaluate(u: Tensor, v: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:
         chart, lens = traced.optics(distortion)
         here = a, b
         if order:
-            here = _to_target(u, v, columns(intrinsics), looks)[0]
-            here = replace(mask, here[0], 0.0), replace(mask, here[1], 0.0)
-            here = attach(lens, (a, b), here, order) if lens.stages else here
+            p, q = _to_target(u, v, columns(intrinsics), looks)[0]
+            target = replace(mask, p, 0.0), replace(mask, q, 0.0)
+            here = attach(lens, here, target, order) if lens.stages else target
         rays = zip(chart.to_ray(*here, order), (0.0, 0.0, 1.0), strict=True)
         return torch.stack([replace(mask, w, axis) for w, axis in rays])
 
@@ -193,14 +209,3 @@ def _keeping(native: Native, pixels: Tensor) -> tuple[Tensor, Tensor, tuple[Tens
 
 
 UNPROJECT = Direction(_formula, native_calls.unproject, _keeping, native_calls.unproject_vjp, "pixels", 2, 3)
-
-
-def _search_recorded(domain: Domain, target: Planes2, found: Found) -> Found:
-    """Run `search` for points that are left open, as a part of an exported program."""
-    if all(stage.is_affine for stage in domain.lens.stages):  # no point is open then
-        return found
-    camera, point = (~(found.solved > 0) & (found.possible > 0)).nonzero(as_tuple=True)
-    a, b, there = search(domain, camera, *(w[camera, point] for w in target))
-    places, solved = (camera, point), torch.where(there, 1.0, -1.0).to(a.dtype)
-    a, b, solved = (plane.index_put(places, w) for plane, w in ((found.a, a), (found.b, b), (found.solved, solved)))
-    return Found(a, b, solved, found.possible)
