@@ -2,9 +2,8 @@
 
 `search` chooses a way, see `domain.InverseBy`. By radius and by stages the domain is a circle, and the solution is
 bracketed; in the plane, secants find a start for damped steps. `_Search` then checks where a solution's ray is seen.
-
-Each of M points has a `camera`, an index. A lens sends (a, b), of the chart's plane, to (u, v); its first stage sends
-it to (p, q), and the later stages that to (u, v).
+Each point has a `camera`, an index. A lens sends (a, b), of the chart's plane, to (u, v): its first stage to (p, q),
+and the later stages that to (u, v).
 """
 
 from __future__ import annotations
@@ -84,8 +83,7 @@ def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Searched
 
 def _invert_later_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> tuple[Planes2, Tensor]:
     """Return the points (p, q) that the later stages send to (u, v), and whether the first one reaches them."""
-    rest = present(domain.optics_of(camera)[1].rest, "a later stage")
-    table = present(domain.inverse, "a table")
+    rest, table = present(domain.optics_of(camera)[1].rest, "a later stage"), present(domain.inverse, "a table")
     p, q = rest.start(u, v)
     for _ in range(_STAGE_STEPS):
         at = rest.at(p, q)
@@ -126,8 +124,7 @@ class _Search:
         """Search; if the domain is a circle, `first` is (p, q), by default (u, v)."""
         a, b = self.radial(*(first or (u, v))) if self.is_circle else self.planar(u, v)
         at = self.lens.at(a, b)
-        x, y = at.value
-        ua, ub, va, vb = at.jacobian
+        (x, y), (ua, ub, va, vb) = at.value, at.jacobian
         valid = self.contains(a, b)
         # an error of one eps in the solution moves its image by an eps of this
         stretch = torch.maximum(ua.abs() + ub.abs(), va.abs() + vb.abs())
@@ -202,8 +199,7 @@ class _Search:
             part = torch.where(good, (part * 4).clamp(max=1), part / 4)
             return moves(state[2], state[3], part), part, *state
 
-        at = self.lens.at(a, b)
-        whole = torch.ones_like(u)
+        at, whole = self.lens.at(a, b), torch.ones_like(u)
         state = whole, *torch.broadcast_tensors(a, b, *at.value, *at.jacobian)
         active, _, a, b, *_ = repeat(step, moves(*at.value, whole), state, steps)
         return a, b, active
@@ -211,18 +207,15 @@ class _Search:
     def _start(self, u: Tensor, v: Tensor) -> Planes2:
         """Return the best of some points that the lens sends as far out as (u, v); secants find their azimuths."""
         target = (u * u + v * v).sqrt()
-        extent = self.domain.extent
 
         def look(far: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
             a, b, least_error, angle, step, last_off = state
-            # the point at this angle that the lens sends as far out as (u, v)
             c, s = torch.cos(angle), torch.sin(angle)
-            rho = extent.start(self.camera, target, c, s)
+            rho = self.domain.extent.start(self.camera, target, c, s)
             trial_a, trial_b = rho * c, rho * s
             x, y = self.lens(trial_a, trial_b)
-            # keep the best; stop close points, so that a result is the same in any batch
             error = (u - x) ** 2 + (v - y) ** 2
-            better = (error < least_error) & far
+            better = (error < least_error) & far  # stop close points, so that a result is the same in any batch
             a, b = torch.where(better, trial_a, a), torch.where(better, trial_b, b)
             least_error = torch.where(better, error, least_error)
             far = far & (least_error > _CLOSE_SHARE**2 * target * target)
