@@ -1,4 +1,8 @@
-"""The evaluation of cameras: the way that a call takes, and the results kept of a camera for the next one."""
+"""The evaluation of cameras: the way that a call takes, and the results kept of a camera for the next one.
+
+`evaluate_points` shapes points to rows, and a camera's `_evaluate` calls `evaluate_rows`: as a constant of an exported
+program, in native code (`_Native` if something learns), or by the formula. `camera_rows` keeps results of parameters.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +34,8 @@ if TYPE_CHECKING:
 
 def evaluate_points(camera: CameraLike, direction: Direction, values: Numbers) -> tuple[Tensor, Tensor]:
     """Return the planes and the mask of `evaluate_rows` for values (*B, *N, size), in their shape."""
-    lead, tensors, size = camera.batch_shape, camera.tensors, direction.size
-    batch, dims = lead, len(lead)
+    batch, tensors, size = camera.batch_shape, camera.tensors, direction.size
+    lead, dims = batch, len(batch)
     if (
         not isinstance(values, Tensor)
         or values.dtype != tensors[0].dtype
@@ -75,18 +79,18 @@ def evaluate_rows(
         with portable_export(rows) as order:
             return direction.formula(model, rows, intrinsics, distortion, cameras, order)
     known = cameras_of(intrinsics, distortion) if way.is_known else None
-    if way.is_native and known is not None and (made := known.native) is not None:
+    if way.is_native and known is not None and (native := known.native) is not None:
         if way.learns:
             planes, valid = _Native.apply(*inputs, known, direction)  # type: ignore[no-untyped-call]
             return planes, valid
-        planes, valid, *_ = direction.native(made, rows.detach())
+        planes, valid, *_ = direction.native(native, rows.detach())
         return planes, valid
     if way.is_native and rows.shape[0] * rows.shape[1] >= _MANY_POINTS:
         warn_if_missing()
+    # the formula: all at once, or block by block, which stay in a cache from one operation to the next
     formula = partial(direction.formula, model)
     if known is None or rows.shape[0] * rows.shape[1] <= _BLOCK_POINTS or not are_free(*inputs):
         return formula(*inputs, known, way.order)
-    # block by block, which stay in a cache from one operation to the next
     step = max(_BLOCK_POINTS * torch.get_num_threads() // len(rows), 1)
     planes = rows.new_empty(direction.size_out, *rows.shape[:2])
     valid = torch.empty(planes.shape[1:], dtype=torch.bool, device=planes.device)
@@ -101,7 +105,7 @@ def native_forms(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[N
 
     None if `evaluate_rows` would record values of the first one's dtype, for several models, and with a shutter.
     """
-    pairs, dtype, is_batch, inputs = [], values[0].dtype, False, [*values]
+    dtype, pairs, inputs = values[0].dtype, [], [*values]
     for camera in cameras:
         if not camera.has_native_form:
             return None
@@ -109,7 +113,7 @@ def native_forms(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[N
         inputs += pairs[-1]
     if not (dtype.is_floating_point and are_free(*inputs)):
         return None
-    made = []
+    made, is_batch = [], False
     for camera, (intrinsics, distortion) in zip(cameras, pairs, strict=True):
         if intrinsics.dtype != dtype or distortion.dtype != dtype:
             return None
@@ -134,8 +138,8 @@ class _Native(Function):
     def forward(
         ctx: Any, rows: Tensor, intrinsics: Tensor, distortion: Tensor, cameras: CameraRows, direction: Direction
     ) -> tuple[Tensor, Tensor]:
-        made = present(cameras.native, "compiled code for the cameras")
-        planes, valid, kept = direction.native_keeping(made, rows)
+        native = present(cameras.native, "compiled code for the cameras")
+        planes, valid, kept = direction.native_keeping(native, rows)
         ctx.save_for_backward(rows, intrinsics, distortion, *kept)
         ctx.cameras, ctx.direction = cameras, direction
         ctx.mark_non_differentiable(valid)
@@ -151,12 +155,12 @@ class _Native(Function):
         wanted, cameras = ctx.needs_input_grad, ctx.cameras
         if torch.is_grad_enabled() or not in_memory(by_planes) or is_recorded():
             # use the formula, with a graph of its own
-            inputs, options = (rows, intrinsics, distortion), {"create_graph": True, "materialize_grads": True}
+            inputs = rows, intrinsics, distortion
             leaves = [t for t, needed in zip(inputs, wanted[:3], strict=True) if needed]
             with torch.enable_grad():
                 planes = ctx.direction.formula(cameras.model, *inputs, cameras)[0]
-                gradients = iter(torch.autograd.grad(planes, leaves, by_planes, **options))
-            return *(next(gradients) if needed else None for needed in wanted[:3]), None, None
+                left = iter(torch.autograd.grad(planes, leaves, by_planes, create_graph=True, materialize_grads=True))
+            return *(next(left) if needed else None for needed in wanted[:3]), None, None
         of_parameters = wanted[1] or wanted[2]
         by_rows, sums = ctx.direction.native_vjp(cameras.native, *kept, by_planes, wanted[0], of_parameters)
         return by_rows, *cameras.cotangents(sums, wanted[1:3]), None, None
