@@ -1,4 +1,9 @@
-"""Cameras of one model in the form of the native geometry: codes of their parts, numbers, and tables."""
+"""Cameras of one model in the form of the native geometry: codes of their parts, numbers, and tables.
+
+`native_of` makes a `Native` of three layers: a `ModelPlan` that all cameras of a model share, `Lenses` that all cameras
+of the same coefficients share, and intrinsics. C reads structs of addresses, and each struct keeps their memory alive.
+A part is a chart or a stage; `parameters` are what parts compute with: coefficients, or numbers made of them.
+"""
 
 from __future__ import annotations
 
@@ -35,9 +40,9 @@ class ModelPlan:
         self.parts, self.count = (structs.Part * len(parts))(*parts), len(parts)
         parameters = (*chart.parameters, *lens.parameters)
         self.parameters = len(parameters)
-        places = {id(c): i for i, c in enumerate(coefficients)}
-        known = [places[id(p)] for p in parameters if id(p) in places]
-        # the coefficients of the parameters; None if the model computes some
+        # which coefficient each parameter is, as the same tensor; None if the model computes some
+        index = {id(c): i for i, c in enumerate(coefficients)}
+        known = [index[id(p)] for p in parameters if id(p) in index]
         self.places = torch.tensor(known, device="cpu") if len(known) == len(parameters) else None
         self.is_all = known == list(range(len(coefficients)))
         self.chart_is_inverted = isinstance(chart, optics.Inverted)
@@ -88,7 +93,7 @@ class Lenses:
     def __init__(
         self, plan: ModelPlan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], struct: structs.Cameras
     ):
-        """Take coefficients (C, n) and their struct, with None for what is not known; `domain` is for what C lacks."""
+        """Take coefficients (C, n) and their struct, null where nothing is known; `domain` is for what C lacks."""
         self.plan, self.optics_of, self.k, self.python_domain, self.struct = plan, optics_of, k, domain, struct
 
     @classmethod
@@ -140,10 +145,10 @@ class Lenses:
         return self._keep(end.expand(self.struct.cameras, 1).double())
 
     def _fill(self, wanted: dict[str, int]) -> None:
-        """Fill in the wanted parts of the domain: names and addresses."""
+        """Have C fill in parts of the domain: wanted are their addresses, and those of inputs, by name."""
         request = structs.Domain.from_buffer_copy(self.request)  # several threads may request at once
-        for name, place in wanted.items():
-            setattr(request, name, place)
+        for name, pointer in wanted.items():
+            setattr(request, name, pointer)
         loaded().camtorch_domain(request)
 
     def _new(self, columns: int) -> int:
@@ -153,8 +158,7 @@ class Lenses:
         """Set the fold and the inverse of a chart that is defined in the other direction."""
         struct, table = self.struct, self.k.new_empty(self.struct.cameras, TABLE_WIDTH)
         struct.chart_safe_radius_sq, struct.chart_table = self._new(1), self._keep(table)
-        wanted = {"safe_radius_sq": struct.chart_safe_radius_sq, "table": struct.chart_table, "is_chart": True}
-        self._fill(wanted)
+        self._fill({"safe_radius_sq": struct.chart_safe_radius_sq, "table": struct.chart_table, "is_chart": True})
         struct.chart_most2 = self._keep(table[:, 1])
 
     def _add_domain(self, tables: bool) -> None:
@@ -165,13 +169,16 @@ class Lenses:
             self.struct.safe_radius_sq = self._keep(domain.safe_radius_sq)
             return
         names = ["safe_radius_sq", "image_radius_sq", *["image_circle_sq", "stagewise"] * plan.has_rest]
-        has_table = tables and plan.has_factor  # made now, as pixels will follow
-        start, step = self._new(len(names) + TABLE_WIDTH * has_table), self.struct.cameras * self.k.dtype.itemsize
-        wanted = {name: start + step * i for i, name in enumerate([*names, *["table"] * has_table])}
+        width = len(names)
+        if tables and plan.has_factor:  # made now, as pixels will follow
+            names, width = [*names, "table"], width + TABLE_WIDTH
+        # in one piece of memory: a column each, and last the table
+        start, step = self._new(width), self.struct.cameras * self.k.dtype.itemsize
+        wanted = {name: start + step * i for i, name in enumerate(names)}
         radii = None if plan.is_radial else plan.radii(lambda: self._optics()[0], structs.MOST_RADII, self.k)
         self._fill(wanted if radii is None else wanted | {"radii": self._keep(radii)})
-        for name, place in wanted.items():
-            setattr(self.struct, name, place)
+        for name, pointer in wanted.items():
+            setattr(self.struct, name, pointer)
 
     def radii_wanted(self) -> dict[str, Tensor]:
         """Return the radii on which lenses are followed, by their names in a request."""
@@ -192,8 +199,7 @@ class Lenses:
         struct = self.struct
         if struct.limits2 is None:
             wanted = {"limits2": self._new(structs.AZIMUTHS), "extent": self._new(structs.EXTENT)}
-            known = ((name, getattr(struct, name)) for name in ("image_circle_sq", "stagewise"))
-            wanted |= {name: place for name, place in known if place is not None}
+            wanted |= {name: getattr(struct, name) for name in ("image_circle_sq", "stagewise")}
             wanted |= {name: self._keep(radii) for name, radii in self.radii_wanted().items()}
             if self.plan.chart_is_inverted:
                 wanted["ends"] = self._keep_ends(self._optics()[0].end(self.k.dtype))
@@ -210,9 +216,9 @@ class Lenses:
         widths = dict.fromkeys(("safe_radius_sq", "image_radius_sq", "image_circle_sq", "stagewise"), 1)
         made, count = {}, self.struct.cameras
         for name, width in {**widths, "table": TABLE_WIDTH, "limits2": structs.AZIMUTHS}.items():
-            if (place := getattr(self.struct, name)) is not None:
+            if (pointer := getattr(self.struct, name)) is not None:
                 dtype = torch.bool if name == "stagewise" else self.k.dtype
-                memory = (ctypes.c_char * (count * width * dtype.itemsize)).from_address(place)
+                memory = (ctypes.c_char * (count * width * dtype.itemsize)).from_address(pointer)
                 made[name] = torch.frombuffer(memory, dtype=dtype).view(count, width).clone()
         return made
 
@@ -325,12 +331,14 @@ def _chart(chart: Chart) -> structs.Part | None:
 
 def _stage(stage: Stage) -> structs.Part | None:
     kind = _code(stage)
-    if kind is not None and isinstance(stage, optics.Surface):
+    if kind is None:
+        return None
+    if isinstance(stage, optics.Surface):
         part = structs.Part(kind=kind, flags=stage.order, n=stage.columns, m=stage.rows, constant=stage.behind)
         part.cells[:], part.centre[:] = stage.cells, stage.centre
         return part
-    if kind is None or not isinstance(stage, optics.Planar):
-        return None if kind is None else structs.Part(kind=kind)
+    if not isinstance(stage, optics.Planar):
+        return structs.Part(kind=kind)
     flags = structs.TANGENTIAL * bool(stage.tangential) | structs.PRISM * bool(stage.prism)
     part, radial = structs.Part(kind=kind, flags=flags), stage.radial
     if radial is None:
