@@ -77,8 +77,8 @@ class Domain:
     @cached_property
     def _followed(self) -> tuple[Tensor, Extent]:
         with torch.inference_mode(False), torch.no_grad():
-            parts = [limits_and_extent(self.optics, k) for k in self.k.split(_CAMERAS_AT_ONCE)]
-            limits2, extents = zip(*parts, strict=True)
+            parts_of_k = self.k.split(_CAMERAS_AT_ONCE)
+            limits2, extents = zip(*(limits_and_extent(self.optics, k) for k in parts_of_k), strict=True)
             return torch.cat(limits2), Extent(*(torch.cat(parts) for parts in zip(*extents, strict=True)))
 
     @cached_property
@@ -161,8 +161,7 @@ class Domain:
     @_per_camera
     def table(self) -> Tensor:
         """Return the table (C, 2 + 2 nodes) of `inverse`."""
-        k = precise(self.k)
-        chart, lens = self.optics(columns(k))
+        chart, lens = self.optics(columns(precise(self.k)))
         radial = present(lens.radial, "a radial factor")
         return tabulate(radial, self._fold, chart.usual_end(self.k.dtype)).to(self.k.dtype)
 

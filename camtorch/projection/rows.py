@@ -1,4 +1,8 @@
-"""The cameras that see rows of points: the values of their parameters, and the results made of them once."""
+"""The cameras that see rows of points: the values of their parameters, and the results made of them once.
+
+`CameraRows` has known values, their domain and native form; `Traced` is what a formula computes with, known or not.
+Both put an ideal camera in place of one that is not `usable`. A mask is 1 or 0, or None if it is 1 everywhere.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +42,7 @@ class CameraRows:
     def __init__(self, model: type[CameraLike], intrinsics: Tensor, distortion: Tensor):
         """Take concrete values (C, 4), (C, n); or (4,), (n,) of one camera."""
         self.model, self._learns = model, distortion.requires_grad
-        known = on_cpu(intrinsics, distortion)
+        known = on_cpu(intrinsics, distortion)  # None if they are there already
         self._same_on_cpu = None if known is None else CameraRows(model, known[0], known[1])
         self.notes = note(intrinsics), note(distortion)
         first, second = (then if mark is None else then.clone() for then, mark in self.notes)
@@ -77,12 +81,14 @@ class CameraRows:
         """Return the cotangents of intrinsics and distortion, if wanted, for sums of `native_calls.project_vjp`."""
         if sums is None:
             return None, None
-        of_intrinsics, sums = sums[:, :4] if wanted[0] else None, sums[:, 4:]
+        of_intrinsics = sums[:, :4] if wanted[0] else None
         if not wanted[1]:
             return of_intrinsics, None
+        sums = sums[:, 4:]
         plan = present(self.native, "compiled code, which gave the sums,").plan
         if plan.places is not None:
             return of_intrinsics, sums if plan.is_all else torch.zeros_like(self.k).index_add_(1, plan.places, sums)
+        # the model computes parameters from coefficients: torch differentiates that
         with torch.enable_grad():
             k = self.k.detach().requires_grad_()
             chart, lens = self.model.optics(columns(k))
@@ -99,8 +105,7 @@ def single_native(model: type[CameraLike], intrinsics: Tensor, k: Tensor) -> Nat
 
 
 def domain_for(model: type[CameraLike], k: Tensor, learns: bool) -> Domain:
-    """Return the domain of lenses (C, n) of a model, kept unless they learn."""
-    # lenses that learn will not be used again
+    """Return the domain of lenses (C, n) of a model, kept unless they learn, and so will not be used again."""
     return Domain(model.optics, k) if learns else domain_of(model.operator_name, k, model.optics)
 
 
@@ -108,14 +113,13 @@ def _constant_tables(domain: Domain) -> dict[str, Any]:
     """Return the properties of a domain whose values are known, as far as a graph may need them; none is a view."""
     if not domain.lens.stages:
         return {}
-    names = ["safe_radius_sq"]
+    names, known = ["safe_radius_sq"], dict[str, Any]()
     if domain.inverse_by in ("stages", "either"):
         names += ["image_circle_sq", "stagewise"]
     if not domain.is_circular:
         names += ["image_radius_sq", "limits2"]
-    known: dict[str, Any] = {name: getattr(domain, name).clone() for name in names}
-    if not domain.is_circular:
         known["extent"] = domain.extent
+    known |= {name: getattr(domain, name).clone() for name in names}
     inverse = InverseTable(domain.table, is_constant=True) if domain.lens.radial else None
     return {**known, "inverse": inverse, "inverse_by": domain.inverse_by}
 
@@ -200,10 +204,8 @@ class Traced(NamedTuple):
             k = torch.where(able, distortion.detach(), _ideal(model, intrinsics, distortion)[1])
             domain = Domain(model.optics, k, recorded_tables(model, k))
         if usable is not None:
-            ideal = _ideal(model, intrinsics, distortion)
-            intrinsics, distortion = (
-                torch.where(usable > 0, t, w) for t, w in zip((intrinsics, distortion), ideal, strict=True)
-            )
+            pairs = zip((intrinsics, distortion), _ideal(model, intrinsics, distortion), strict=True)
+            intrinsics, distortion = (replace(usable, values, ideal) for values, ideal in pairs)
         return cls(model, intrinsics, distortion, domain, usable)
 
     def optics(self, distortion: Tensor) -> tuple[Chart, Lens]:
@@ -213,14 +215,14 @@ class Traced(NamedTuple):
 
 
 def replace(mask: Tensor | None, plane: Tensor, value: float | Tensor) -> Tensor:
-    """Return the plane where the mask is 1, and the value where it is 0; a mask that is None is 1 everywhere."""
+    """Return the plane where the mask is 1, and the value where it is 0."""
     return plane if mask is None else torch.where(mask > 0, plane, value)
 
 
 def to_mask(margin: Tensor, looks: bool = False) -> Tensor | None:
     """Return 1 for a positive margin, else 0, in its dtype: compiled graphs write bools one by one.
 
-    If the call `looks` at values, it is None for margins that are all positive: then nothing is to be replaced.
+    If the call `looks` at values, it is None for margins that are all positive.
     """
     margin = margin.detach()
     return None if looks and bool(margin.amin() > 0) else (margin > 0).to(margin.dtype)
