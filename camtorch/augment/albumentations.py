@@ -113,8 +113,12 @@ class Transform(FrontEnd, A.DualTransform):
             stays = value is None or name in ("camera", "applied_transforms", self.save_key)
             if stays or (target in _MAY_BE_EMPTY and len(value) == 0):
                 continue
-            # a name that begins with a kind is known
-            field = name if name == target else f"{kind_of(target, value, {}, _OWNER)}_{i}"
+            field = name
+            if name != target:
+                kind = kind_of(target, value, self.augmentation.fields, _OWNER, single=True)
+                if kind is None:
+                    continue
+                field = f"{kind}_{i}"  # a name that begins with a kind is known
             places[field], fields[field] = (name, target), _given(target, value, camera)
 
         def write(moved: Sample) -> Sample:

@@ -163,7 +163,7 @@ class Augmentation(SampleTransform):
     # _part           lenses and mounts, by C; RandomMount with a shift; RandomShutter
     # _new_camera     lenses and mounts, whose formulas take float64
     # _part_between   lenses and mounts, with colours and light
-    # and, without a draw: size_after, tell_of_empty_images, _chain_error
+    # and, without a draw: size_after, tell_of_empty_images, _tell_of, _chain_error, _warp_options
 
     def _draw_numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> Draw:
         """Return a draw as lists, arrays or tensors; see `ranges.py`."""
@@ -337,8 +337,8 @@ class Augmentation(SampleTransform):
 
     def tell_of_empty_images(self, camera: Camera) -> None:
         """Warn, once, if new images of `camera` will be mostly empty; draws from a generator of its own show it."""
-        if self.min_filled is not None or self._calls.has_looked or self.p == 0:
-            return
+        if self.min_filled is not None or self._calls.has_looked or self.p == 0 or self.crops:
+            return  # `crops` need boxes, which say what is intended
         camera = self._on_host(camera)
         camera = camera[0] if camera.is_mixed else camera
         if not are_concrete(camera.intrinsics):

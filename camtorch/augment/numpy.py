@@ -82,8 +82,11 @@ class Transform(FrontEnd):
     ) -> Sample:
         """Augment a sample: keyword arguments, a dict, or both; see `Augmentation.forward` for the other arguments."""
         tensors, write = self._read(sample, fields, self.camera)
+        options = _set(draw=draw, generator=generator)
+        if options and isinstance(self.augmentation, FaceNormalizer):
+            raise TypeError(f"{_OWNER}: draw and generator must be None for a FaceNormalizer, as it draws nothing")
         with torch.no_grad():
-            return write(self.augmentation.forward(tensors, **_set(draw=draw, generator=generator)))
+            return write(self.augmentation.forward(tensors, **options))
 
     def inverse(
         self,

@@ -208,7 +208,7 @@ class SampleCall:
         self._may_be_refused = [i for i, how in enumerate(hows) if how in ("boxes", "pose", "rotation vectors")]
 
     def _reader_of_images(self, job: structs.Job, like: Tensor, how: Sampler) -> Reader:
-        """Write into a job of C what all runs share; return what writes the rest in each run. So do the next two."""
+        """Write into a job of C what all runs share; return what writes the rest in each run."""
         image = _as_images(like, self._batched)
         make_images = maker(image, self._count, self._sizes[1])
         result = make_images()

@@ -1,6 +1,7 @@
 """Two cameras at one place, and the way that images and points go from one to the other.
 
-Which way a warp goes is decided in four places:
+Which way a warp goes is decided in four places, after `ready` has asked for a kept call, and an `UncheckedWarp` whether
+images are copied, resized or halved:
 
 1. `CameraPair.route`: kept positions, those of a graph, strips, or an operator of a compiled graph.
 2. `CameraPair.computed`: positions to keep are found by the same warp on the CPU, by an operator, or by `locate`.

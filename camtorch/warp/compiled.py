@@ -1,7 +1,7 @@
 """Operators that compiled graphs call instead of tracing: a warp of images, and sampling positions with a tolerance.
 
-Exported programs know them by the name of this module. Operators take neither flags nor
-fills, so that options are `written` as texts, and `is_last` is "True" if channels come last in memory, else "False".
+Exported programs know them by the name of this module. Operators take neither flags nor fills, so that options are
+`written` as texts, and `is_last` is "True" if channels come last in memory, else "False".
 """
 
 from __future__ import annotations

@@ -105,6 +105,16 @@ def test_further_targets_and_lists():
     np.testing.assert_array_equal(out["images"][1], out["image"])
 
 
+def test_further_targets_have_the_kinds_that_fields_give():
+    fields = {"lidar": "points", "scores": "keep"}
+    pipeline = A.Compose([transform(fields=fields)], additional_targets={"behind": "lidar", "more": "scores"}, seed=1)
+    points = np.random.default_rng(0).random((5, 3)).astype(np.float32) + 1
+    out = pipeline(image=sample()["image"], lidar=points, behind=points, more=points)
+    assert not np.array_equal(out["lidar"], points)
+    np.testing.assert_array_equal(out["behind"], out["lidar"])
+    np.testing.assert_array_equal(out["more"], points)
+
+
 def test_what_is_wrong_is_told():
     with pytest.raises(TypeError, match="augmentation must be an Augmentation; got str"):
         ct.augment.albumentations.Transform("mount")

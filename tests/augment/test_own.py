@@ -1,6 +1,7 @@
 """An augmentation of one's own, as anybody would write it."""
 
 import pickle
+from types import MappingProxyType
 
 import pytest
 import torch
@@ -89,3 +90,25 @@ def test_errors_within_a_change_are_told_as_they_are():
     change.parts[0].camera = None
     with pytest.raises(AttributeError, match="'NoneType' object has no attribute 'expand'"):
         _ = change.source
+
+
+class Facing(ct.augment.Augmentation):
+    """A pinhole camera that looks at a box of the sample."""
+
+    crops = MappingProxyType({"box": 0})
+
+    def new_camera(self, source, values):
+        crop = ct.views.look_at(source, values["box"], (24, 24))
+        return crop.target, crop.rotation
+
+
+def test_boxes_of_a_sample_come_only_with_it():
+    boxes = torch.tensor([[20.0, 15.0, 40.0, 35.0]])
+    out = Facing(camera=camera())(image=torch.rand(3, *SIZE), boxes=boxes)  # whose new images nothing looks at before
+    assert out["image"].shape == (3, 24, 24)
+
+
+def test_a_face_normalizer_draws_nothing():
+    transform = ct.augment.numpy.Transform(ct.augment.FaceNormalizer(camera=camera()))
+    with pytest.raises(TypeError, match="draw and generator must be None for a FaceNormalizer"):
+        transform(image=torch.rand(*SIZE).numpy(), generator=torch.Generator())
