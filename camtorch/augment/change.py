@@ -304,9 +304,9 @@ class Change:
             return (self.rotation if batched else self.rotation[0]).clone()
         return _eye(self.parts[0].camera.intrinsics) if rotation is None else rotation.clone()
 
-    several = _renamed("several", "camera_for_sample", batched=True)
-    single = _renamed("single", "camera_for_sample", batched=False)
-    single_rotation = _renamed("single_rotation", "rotation_for_sample", batched=False)
+    several: Camera = _renamed("several", "camera_for_sample", batched=True)
+    single: Camera = _renamed("single", "camera_for_sample", batched=False)
+    single_rotation: Tensor = _renamed("single_rotation", "rotation_for_sample", batched=False)
 
     @property
     def rotation(self) -> Tensor:
