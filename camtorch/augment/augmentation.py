@@ -218,6 +218,8 @@ class Augmentation(SampleTransform):
 
     def _state_key(self) -> tuple[Any, ...]:
         """Return what, but for tensors, changes follow from: another key if anything of it or of its parts was set."""
+        if torch.compiler.is_compiling():  # nothing is kept then, and compilers know no `str` of a list
+            return ()
         states = [vars(part) for part in self.modules()]
         revisions = [getattr(state.get("_calls"), "revision", None) for state in states]  # with public attributes
         return *revisions, str([[state.get(name) for name in ("options", "ranges", "image_size")] for state in states])
