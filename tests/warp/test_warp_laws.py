@@ -200,7 +200,8 @@ def test_detached_and_row_by_row_it_keeps_all_that_it_is_made_of(kind):
     assert (type(warp), warp.options) == (type(learning), learning.options)
     assert not any(t.requires_grad for part in (warp, *warp.children()) for t in (*part.parameters(), *part.buffers()))
     for one, other in zip(results(warp, images, points), expected, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=1e-9)
+        # relative too: points near the rim of the view land at pixels of any size
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
     if "shifted" not in kind:
         back = warp.inverse()
         assert not any(t.requires_grad for t in (*back.parameters(), *back.buffers()))
@@ -213,7 +214,7 @@ def test_detached_and_row_by_row_it_keeps_all_that_it_is_made_of(kind):
     row = warp.rows_of(warp.source[[1]], warp.target[[1]], rotation, [1])
     assert type(row) is type(warp)
     for one, other in zip(results(row, images[1:], points[1:]), expected, strict=True):
-        torch.testing.assert_close(one, other[1:], rtol=0, atol=1e-9)
+        torch.testing.assert_close(one, other[1:], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.uint16, torch.float16, torch.float32])
