@@ -16,7 +16,6 @@ from camtorch.augment.change import Change, one_or_batch
 from camtorch.augment.clips import Clips
 from camtorch.augment.devices import remember_camera
 from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS
-from camtorch.augment.keywords import check_arguments
 from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess, check_agrees, check_targets, refuse
 from camtorch.augment.plan import Batch, SamplePlan, form_of, move
@@ -27,6 +26,7 @@ from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_free, in_worker, is_unknown
 from camtorch.native.library import warn_if_missing
 from camtorch.values.arguments import as_flag, as_mapping, as_number, check_devices, no_camera
+from camtorch.values.keywords import check_arguments
 from camtorch.values.module import GeometryModule
 from camtorch.values.threads import on_one_thread
 from camtorch.warp.options import Options, as_options

@@ -14,7 +14,7 @@ from kornia.geometry.keypoints import Keypoints
 import camtorch as ct
 from camtorch import augment
 from camtorch.augment import kornia as adapter
-from camtorch.augment import kornia_parts
+from camtorch.augment.kornia import private
 
 HEIGHT, WIDTH = SIZE = 96, 128
 CLASSES = adapter.RandomMount, adapter.RandomLens, adapter.RandomCamera
@@ -440,7 +440,7 @@ def test_a_kornia_that_lacks_a_part_is_refused_by_its_name(owner, name, monkeypa
     else:
         monkeypatch.delattr(owner, name)
     with pytest.raises(ImportError, match=rf"got 0.*\b{name}\b.*pip install 'kornia==0.9"):
-        runpy.run_path(kornia_parts.__file__)
+        runpy.run_path(private.__file__)
 
 
 def test_the_size_of_new_images_follows_another_camera():

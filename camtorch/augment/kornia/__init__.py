@@ -25,11 +25,11 @@ from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import check_single
 from camtorch.augment.change import Change, Part
-from camtorch.augment.containers import wrap_containers
 from camtorch.augment.front_end import FrontEnd, check_front_end
-from camtorch.augment.kornia_parts import input_metadata_only, transform_output_shape
+from camtorch.augment.kornia.containers import wrap_containers
+from camtorch.augment.kornia.params import KIND, Params, camera_with_params, kind_of_camera, with_boxes, with_cameras
+from camtorch.augment.kornia.private import input_metadata_only, transform_output_shape
 from camtorch.augment.matrices import Guess
-from camtorch.augment.params import KIND, Params, camera_with_params, kind_of_camera, with_boxes, with_cameras
 from camtorch.augment.sample import detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import kind

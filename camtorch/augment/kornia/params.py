@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch.augment.kornia_parts import ParamItem
+from camtorch.augment.kornia.private import ParamItem
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import collate_cameras
 from camtorch.evaluate.door import pytree

@@ -18,6 +18,7 @@ import torch
 from albumentations.core.type_definitions import Targets
 
 from camtorch.augment import numpy as arrays
+from camtorch.augment.albumentations.saving import as_plain, from_plain
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import Unknown, camera_of_sample
 from camtorch.augment.fields import KINDS, PLACE
@@ -25,7 +26,6 @@ from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.matrices import NAMES
 from camtorch.augment.names import kind_of
 from camtorch.augment.sample import Sample, detached
-from camtorch.augment.saving import as_plain, from_plain
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import present
 

@@ -25,10 +25,10 @@ from camtorch.augment.augmentation import put_place
 from camtorch.augment.change import Change
 from camtorch.augment.fields import OWN, PLACE
 from camtorch.augment.front_end import FrontEnd
-from camtorch.augment.kornia_parts import BasicAugmentationBase
+from camtorch.augment.kornia.params import Params, parts_of, with_cameras
+from camtorch.augment.kornia.private import BasicAugmentationBase
 from camtorch.augment.matrices import Guess, pinhole_of_matrix
 from camtorch.augment.names import is_text, kind_of
-from camtorch.augment.params import Params, parts_of, with_cameras
 from camtorch.augment.sample import Sample, Single, detached, on_samples
 
 
