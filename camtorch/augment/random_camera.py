@@ -17,6 +17,7 @@ from camtorch.augment.fields import Named
 from camtorch.augment.presets import PresetName
 from camtorch.augment.ranges import Draw, RangeLike, as_range
 from camtorch.cameras.camera import Camera
+from camtorch.rays.depth import as_depth
 from camtorch.warp.shifted import ShiftedWarp
 
 _SHIFTS = "shift_x", "shift_y", "shift_z"
@@ -176,9 +177,10 @@ class RandomMount(CameraDrawer):
         part = super()._part(source, {name: v for name, v in draw.items() if name not in (*_SHIFTS, *_DEPTHS)})
         shifts = [torch.as_tensor(draw[name], dtype=torch.float64) for name in _SHIFTS]
         shift = torch.stack(shifts, -1).expand(len(draw["apply"]), 3)
-        warp = ShiftedWarp(
-            source, part.target, part.warp.rotation, draw[key], _DEPTHS[key][1], shift, **self._warp_options
-        )
+        kind = _DEPTHS[key][1]
+        depth = as_depth(draw[key], kind, source.size_for(self._name), self._name, draw[key].device)
+        turned = part.warp.rotation
+        warp = ShiftedWarp(source, part.target, turned, depth, kind, shift, self._name, **self._warp_options)
         return replace(part, moves=warp)
 
 

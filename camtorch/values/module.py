@@ -118,6 +118,13 @@ class GeometryModule(UnsharedState):
         else:
             state["_non_persistent_buffers_set"].add(name)
 
+    def share(self, other: nn.Module) -> Self:
+        """Take the tensors of a module of the same kind, without their graph and without a copy; return this one."""
+        for name, tensor in (*other._parameters.items(), *other._buffers.items()):
+            is_persistent = name not in self._non_persistent_buffers_set
+            self.put(name, None if tensor is None else tensor.detach(), is_persistent)
+        return self
+
     def freeze_like(self, *sources: nn.Module) -> Self:
         """Freeze the parameters if no tensor of `sources`, which this module was made from, requires grad."""
         tensors = [t for source in sources for t in (*source.parameters(), *source.buffers())]

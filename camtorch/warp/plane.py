@@ -238,7 +238,7 @@ class BirdsEye(PlaneWarp):
     def detach(self) -> BirdsEye:
         options: Any = {name: value for name, value in self.options.items() if name != "tolerance"}
         options |= {"x": self.x, "y": self.y, "resolution": self.resolution}
-        return BirdsEye(self.source.detach(), self.extrinsics.detach(), **options)
+        return BirdsEye(self.source.detach(), self.extrinsics.detach(), **options).share(self)
 
     @property
     def grid_points(self) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from camtorch.cameras.camera import Camera
-from camtorch.rays.depth import as_depth, depth_scale
+from camtorch.rays.depth import depth_scale
 from camtorch.warp.grid import to_positions
 from camtorch.warp.lattice import PixelPositions
 from camtorch.warp.moving import placed
@@ -42,12 +42,14 @@ class ShiftedWarp(Warp):
         depth: Tensor,
         kind: str,
         shift: Tensor,
+        owner: str = "ShiftedWarp",
         **options: Any,
     ):
+        """Take depth of a kind that is valid; owner: who made this warp, for errors."""
         super().__init__(source, target, **options)
         self.turned_by(rotation)
+        self._owner = owner
         count = len(shift)
-        as_depth(depth, kind, source.size_for("RandomMount"), "RandomMount", depth.device)
         with torch.no_grad():
             rays, has_ray = source.rays()
             length, known = depth_scale(depth[:, 0].to(rays), rays, has_ray, kind)
@@ -62,11 +64,13 @@ class ShiftedWarp(Warp):
 
     def own_parts(self, index: list[int] | None = None) -> dict[str, Any]:
         rows = slice(None) if index is None else index
-        return {"depth": self.distance[rows][:, None], "kind": "distance", "shift": self.shift[rows]}
+        depth, shift = self.distance[rows][:, None], self.shift[rows]
+        return {"depth": depth, "kind": "distance", "shift": shift, "owner": self._owner}
 
     def inverse(self) -> Warp:
         raise ValueError(
-            "RandomMount: a shift has no inverse, since the new camera may not see every point. Keep the given sample"
+            f"{self._owner}: a shift has no inverse, since the new camera may not see every point. "
+            "Keep the given sample"
         )
 
     def transform_positions(self, points: Tensor) -> Tensor:

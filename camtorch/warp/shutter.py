@@ -97,8 +97,8 @@ class RollingShutter(GeometryModule):
         return RollingShutter(readout, rates, direction=self.direction)
 
     def detach(self) -> RollingShutter:
-        """Return the shutter with the same numbers, which do not learn."""
-        return RollingShutter(self.readout.detach(), self.rates.detach(), direction=self.direction)
+        """Return the same shutter without a graph: it shares the numbers of this one, and does not learn."""
+        return RollingShutter(self.readout.detach(), self.rates.detach(), direction=self.direction).share(self)
 
     def read_at(self, pixels: Tensor, size: tuple[int, int]) -> Tensor:
         """Return when pixels (..., 2) are read, in readouts from the middle one."""

@@ -1,4 +1,7 @@
-"""The `Warp`: every image operation between two cameras is one."""
+"""The `Warp`: images and labels from one camera to another.
+
+Other kinds of warps are subclasses, but for `Reproject`: where it samples follows from a depth, which comes with images.
+"""
 
 from __future__ import annotations
 
@@ -307,10 +310,10 @@ class Warp(CameraPair):
         return {}
 
     def detach(self) -> Warp:
-        """Return the same warp, which does not learn."""
+        """Return the same warp without a graph: it shares all numbers with this one, and does not learn."""
         parts = {"rotation": self.rotation, **self.own_parts()}
         parts = {name: part.detach() if hasattr(part, "detach") else part for name, part in parts.items()}
-        return self.between(self.source.detach(), self.target.detach(), **self.options, **parts)
+        return self.between(self.source.detach(), self.target.detach(), **self.options, **parts).share(self)
 
     def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
         """Return the warp of these rows of a batch, whose cameras and rotations are given."""

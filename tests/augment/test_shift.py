@@ -129,6 +129,19 @@ def test_without_depth_it_says_so():
             call()
 
 
+def test_errors_name_the_augmentation_that_raises_them():
+    class Trolley(ct.augment.RandomMount):
+        """A mount of one's own."""
+
+    camera = lens()
+    augment = Trolley(shift=(0.02, 0.02, 0), camera=camera)
+    out = augment(sample_of(camera))
+    with pytest.raises(ValueError, match=r"^Trolley: a shift has no inverse"):
+        augment.inverse(out)
+    with pytest.raises(ValueError, match=r"^Trolley: depth must be \(B, 1, H, W\)"):
+        augment.change(camera, {**augment.draw(1), "of_depth": torch.ones(1, 1, 20, 30)})
+
+
 def test_the_distances_of_a_sample_replace_those_of_a_draw():
     camera = lens()
     sample = sample_of(camera)

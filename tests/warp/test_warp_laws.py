@@ -199,6 +199,12 @@ def test_detached_and_row_by_row_it_keeps_all_that_it_is_made_of(kind):
     expected, warp = results(learning, images, points), learning.detach()
     assert (type(warp), warp.options) == (type(learning), learning.options)
     assert not any(t.requires_grad for part in (warp, *warp.children()) for t in (*part.parameters(), *part.buffers()))
+    numbers = dict((*warp.named_parameters(), *warp.named_buffers()))
+    for name, number in (*learning.named_parameters(), *learning.named_buffers()):
+        # a bird's eye has its target and its plane from its options
+        if not (kind == "above" and name.startswith("target")):
+            assert numbers[name].data_ptr() == number.data_ptr(), name
+    assert warp.state_dict().keys() >= learning.state_dict().keys()
     for one, other in zip(results(warp, images, points), expected, strict=True):
         # relative too: points near the rim of the view land at pixels of any size
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
