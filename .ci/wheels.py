@@ -70,7 +70,7 @@ TARGETS = {
 _EXPECTED = """
 from camtorch.native import build, structs, structure
 print(build.checksum(), structs.CHECKSUM, *structure.offsets(structs.STRUCTS))
-print(*structs.Library.types)
+print(*structs.Library.__annotations__)
 """
 
 

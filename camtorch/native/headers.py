@@ -13,26 +13,25 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 _HERE = Path(__file__).resolve().parent
-# types of fields, and of what calls take and return: in ctypes, and of their values
+# types of fields, and of what calls take and return: in structs.py, and in ctypes
 _FIELDS = {
-    "*": ("c_void_p", "int | None"),
-    "int64_t": ("c_int64", "int"),
-    "int32_t": ("c_int32", "int"),
-    "double": ("c_double", "float"),
+    "*": ("Pointer", "c_void_p"),
+    "int64_t": ("Int64", "c_int64"),
+    "int32_t": ("Int32", "c_int32"),
+    "double": ("Double", "c_double"),
 }
-_GIVEN = {"int64_t": ("c_int64", "int"), "double*": ("c_void_p", "int"), "char*": ("c_char_p", "bytes")}
-_RESULTS = _GIVEN | {"int32_t": ("c_int32", "int"), "unsigned": ("c_uint32", "int"), "void": ("None", "None")}
+_GIVEN = {"int64_t": "Int64", "double*": "Pointer", "char*": "Text"}
+_RESULTS = _GIVEN | {"int32_t": "Int32", "unsigned": "Unsigned", "void": "Void"}
 _DECLARED = re.compile(r"\benum\s*\{([^}]*)\}|typedef struct \{([^}]*)\}\s*(\w+);")
 _NUMBERS = re.compile(r"^#define (\w+) ((?:(?:, )?-?\d[\d.e-]*f?)+)$", re.M)
 _CALL = re.compile(r"^EXPORTED (?:const )?(\w+ \*?)camtorch_(\w+)\((.*)\) \{|\bENTRY\((\w+), (\w+), (.*?)\)", re.M)
 _HEAD = '''"""The structures, numbers and calls of the C files: `python -m camtorch.native.headers` writes them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from ctypes import POINTER, c_char_p, c_double, c_int32, c_int64, c_uint32, c_void_p
+from ctypes import c_double, c_int32, c_int64, c_void_p
+from typing import Annotated
 
-from camtorch.native.structure import Calls, Numbers, Struct
+from camtorch.native.structure import Calls, Double, Int32, Int64, Numbers, Pointer, Struct, Text, Unsigned, Void
 '''
 
 
@@ -102,22 +101,17 @@ def structs_py(folder: Path = _HERE) -> str:
     found = read(folder)
     lines = [_HEAD, f"CHECKSUM = {found.checksum}", "", *(f"{name} = {value}" for name, value in found.values.items())]
     for struct, fields in found.structs.items():
-        kinds, values = list[str](), list[str]()
-        for name, (kind, many) in fields.items():
-            own, (of, value) = name + "_" * keyword.iskeyword(name), _FIELDS.get(kind, (kind, kind))
-            kinds.append(f'        ("{own}", {of}{f" * {many}" if many else ""}),')
-            values.append(f"    {own}: {'Numbers' if many else value}")
         lines += ["", "", f"class {struct}(Struct):", f'    """`{struct}` of the headers."""', "", "    __slots__ = ()"]
-        lines += ["    _fields_ = (", *kinds, "    )", *values]
-    lines += ["", "", f"STRUCTS = {', '.join(found.structs)}", "", "", "class Library(Calls):"]
-    lines += ['    """The compiled library."""', "", "    types = {"]
-    hints = list[str]()
+        for name, (kind, many) in fields.items():
+            one, in_c = _FIELDS.get(kind, (kind, kind))
+            hint = f"Annotated[Numbers, {in_c} * {many}]" if many else one
+            lines.append(f"    {name}{'_' * keyword.iskeyword(name)}: {hint}")
+    lines += ["", "", f"STRUCTS = {', '.join(found.structs)}", "for struct in STRUCTS:", "    struct.lay_out()"]
+    lines += ["", "", "class Library(Calls):", '    """The compiled library."""', ""]
     for name, (result, given) in found.calls.items():
-        kinds_of = {one: (f"POINTER({one[:-1]})", one[:-1]) for one in given if one[:-1] in found.structs} | _GIVEN
-        takes, of = (", ".join(kinds_of[one][i] for one in given) for i in (0, 1))
-        lines.append(f'        "{name}": ({_RESULTS[result][0]}, [{takes}]),')
-        hints.append(f"    {name}: Callable[[{of}], {_RESULTS[result][1]}]")
-    return "\n".join([*lines, "    }", *hints, ""])
+        takes = ", ".join(one[:-1] if one[:-1] in found.structs else _GIVEN[one] for one in given)
+        lines.append(f"    {name}: Callable[[{takes}], {_RESULTS[result]}]")
+    return "\n".join([*lines, ""])
 
 
 if __name__ == "__main__":

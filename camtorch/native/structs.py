@@ -1,11 +1,10 @@
 """The structures, numbers and calls of the C files: `python -m camtorch.native.headers` writes them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from ctypes import POINTER, c_char_p, c_double, c_int32, c_int64, c_uint32, c_void_p
+from ctypes import c_double, c_int32, c_int64, c_void_p
+from typing import Annotated
 
-from camtorch.native.structure import Calls, Numbers, Struct
+from camtorch.native.structure import Calls, Double, Int32, Int64, Numbers, Pointer, Struct, Text, Unsigned, Void
 
 CHECKSUM = 595640963
 
@@ -140,469 +139,260 @@ class Agreement(Struct):
     """`Agreement` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("points", c_void_p),
-        ("measures", c_void_p),
-        ("order", c_void_p),
-        ("counts", c_void_p),
-        ("numbers", c_void_p),
-        ("best", c_void_p),
-        ("costs", c_void_p),
-        ("agree", c_void_p),
-        ("rows", c_void_p),
-        ("row_count", c_int64),
-        ("count", c_int64),
-        ("samples", c_int64),
-        ("most", c_double),
-        ("next", c_void_p),
-    )
-    points: int | None
-    measures: int | None
-    order: int | None
-    counts: int | None
-    numbers: int | None
-    best: int | None
-    costs: int | None
-    agree: int | None
-    rows: int | None
-    row_count: int
-    count: int
-    samples: int
-    most: float
-    next: int | None
+    points: Pointer
+    measures: Pointer
+    order: Pointer
+    counts: Pointer
+    numbers: Pointer
+    best: Pointer
+    costs: Pointer
+    agree: Pointer
+    rows: Pointer
+    row_count: Int64
+    count: Int64
+    samples: Int64
+    most: Double
+    next: Pointer
 
 
 class Job(Struct):
     """`Job` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("source", c_void_p),
-        ("result", c_void_p),
-        ("source_strides", c_int64 * 4),
-        ("result_strides", c_int64 * 4),
-        ("count", c_int64),
-        ("channels", c_int64),
-        ("source_height", c_int64),
-        ("source_width", c_int64),
-        ("height", c_int64),
-        ("width", c_int64),
-        ("fill", c_void_p),
-        ("fill_elements", c_void_p),
-        ("grid", c_void_p),
-        ("grid_strides", c_int64 * 4),
-        ("grid_is_double", c_int64),
-        ("mapped", c_void_p),
-        ("mapped_stride", c_int64),
-        ("nodes", c_void_p),
-        ("node_strides", c_int64 * 2),
-        ("cells", c_void_p),
-        ("cell_stride", c_int64),
-        ("rows", c_int64),
-        ("columns", c_int64),
-        ("exact", c_void_p),
-        ("exact_stride", c_int64),
-        ("type", c_int32),
-        ("mode", c_int32),
-        ("padding", c_int32),
-        ("tile_rows", c_int32),
-        ("next", c_int64),
-    )
-    source: int | None
-    result: int | None
-    source_strides: Numbers
-    result_strides: Numbers
-    count: int
-    channels: int
-    source_height: int
-    source_width: int
-    height: int
-    width: int
-    fill: int | None
-    fill_elements: int | None
-    grid: int | None
-    grid_strides: Numbers
-    grid_is_double: int
-    mapped: int | None
-    mapped_stride: int
-    nodes: int | None
-    node_strides: Numbers
-    cells: int | None
-    cell_stride: int
-    rows: int
-    columns: int
-    exact: int | None
-    exact_stride: int
-    type: int
-    mode: int
-    padding: int
-    tile_rows: int
-    next: int
+    source: Pointer
+    result: Pointer
+    source_strides: Annotated[Numbers, c_int64 * 4]
+    result_strides: Annotated[Numbers, c_int64 * 4]
+    count: Int64
+    channels: Int64
+    source_height: Int64
+    source_width: Int64
+    height: Int64
+    width: Int64
+    fill: Pointer
+    fill_elements: Pointer
+    grid: Pointer
+    grid_strides: Annotated[Numbers, c_int64 * 4]
+    grid_is_double: Int64
+    mapped: Pointer
+    mapped_stride: Int64
+    nodes: Pointer
+    node_strides: Annotated[Numbers, c_int64 * 2]
+    cells: Pointer
+    cell_stride: Int64
+    rows: Int64
+    columns: Int64
+    exact: Pointer
+    exact_stride: Int64
+    type: Int32
+    mode: Int32
+    padding: Int32
+    tile_rows: Int32
+    next: Int64
 
 
 class Images(Struct):
     """`Images` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("jobs", c_void_p),
-        ("count", c_int64),
-        ("image", c_int64),
-    )
-    jobs: int | None
-    count: int
-    image: int
+    jobs: Pointer
+    count: Int64
+    image: Int64
 
 
 class Classification(Struct):
     """`Classification` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("nodes", c_void_p),
-        ("node_strides", c_int64 * 2),
-        ("mapped", c_void_p),
-        ("mapped_stride", c_int64),
-        ("rim", c_void_p),
-        ("rim_stride", c_int64),
-        ("count", c_int64),
-        ("rows", c_int64),
-        ("columns", c_int64),
-        ("height", c_int64),
-        ("width", c_int64),
-        ("source_height", c_double),
-        ("source_width", c_double),
-        ("tolerance", c_double),
-        ("padding", c_int32),
-        ("cells", c_void_p),
-        ("scratch", c_void_p),
-    )
-    nodes: int | None
-    node_strides: Numbers
-    mapped: int | None
-    mapped_stride: int
-    rim: int | None
-    rim_stride: int
-    count: int
-    rows: int
-    columns: int
-    height: int
-    width: int
-    source_height: float
-    source_width: float
-    tolerance: float
-    padding: int
-    cells: int | None
-    scratch: int | None
+    nodes: Pointer
+    node_strides: Annotated[Numbers, c_int64 * 2]
+    mapped: Pointer
+    mapped_stride: Int64
+    rim: Pointer
+    rim_stride: Int64
+    count: Int64
+    rows: Int64
+    columns: Int64
+    height: Int64
+    width: Int64
+    source_height: Double
+    source_width: Double
+    tolerance: Double
+    padding: Int32
+    cells: Pointer
+    scratch: Pointer
 
 
 class Laying(Struct):
     """`Laying` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("nodes", c_void_p),
-        ("cells", c_void_p),
-        ("exact", c_void_p),
-        ("exact_count", c_int64),
-        ("grid", c_void_p),
-        ("mapped", c_void_p),
-        ("count", c_int64),
-        ("rows", c_int64),
-        ("columns", c_int64),
-        ("height", c_int64),
-        ("width", c_int64),
-        ("is_transposed", c_int64),
-        ("next", c_int64),
-    )
-    nodes: int | None
-    cells: int | None
-    exact: int | None
-    exact_count: int
-    grid: int | None
-    mapped: int | None
-    count: int
-    rows: int
-    columns: int
-    height: int
-    width: int
-    is_transposed: int
-    next: int
+    nodes: Pointer
+    cells: Pointer
+    exact: Pointer
+    exact_count: Int64
+    grid: Pointer
+    mapped: Pointer
+    count: Int64
+    rows: Int64
+    columns: Int64
+    height: Int64
+    width: Int64
+    is_transposed: Int64
+    next: Int64
 
 
 class Part(Struct):
     """`Part` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("kind", c_int32),
-        ("flags", c_int32),
-        ("factor", c_int32),
-        ("n", c_int32),
-        ("m", c_int32),
-        ("constant", c_double),
-        ("cells", c_double * 2),
-        ("centre", c_double * 2),
-    )
-    kind: int
-    flags: int
-    factor: int
-    n: int
-    m: int
-    constant: float
-    cells: Numbers
-    centre: Numbers
+    kind: Int32
+    flags: Int32
+    factor: Int32
+    n: Int32
+    m: Int32
+    constant: Double
+    cells: Annotated[Numbers, c_double * 2]
+    centre: Annotated[Numbers, c_double * 2]
 
 
 class Cameras(Struct):
     """`Cameras` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("parts", c_void_p),
-        ("part_count", c_int64),
-        ("is_double", c_int64),
-        ("cameras", c_int64),
-        ("intrinsics", c_void_p),
-        ("parameters", c_void_p),
-        ("parameter_count", c_int64),
-        ("constants", c_void_p),
-        ("constant_count", c_int64),
-        ("usable", c_void_p),
-        ("safe_radius_sq", c_void_p),
-        ("image_radius_sq", c_void_p),
-        ("limits2", c_void_p),
-        ("extent", c_void_p),
-        ("table", c_void_p),
-        ("stagewise", c_void_p),
-        ("image_circle_sq", c_void_p),
-        ("chart_safe_radius_sq", c_void_p),
-        ("chart_most2", c_void_p),
-        ("chart_table", c_void_p),
-    )
-    parts: int | None
-    part_count: int
-    is_double: int
-    cameras: int
-    intrinsics: int | None
-    parameters: int | None
-    parameter_count: int
-    constants: int | None
-    constant_count: int
-    usable: int | None
-    safe_radius_sq: int | None
-    image_radius_sq: int | None
-    limits2: int | None
-    extent: int | None
-    table: int | None
-    stagewise: int | None
-    image_circle_sq: int | None
-    chart_safe_radius_sq: int | None
-    chart_most2: int | None
-    chart_table: int | None
+    parts: Pointer
+    part_count: Int64
+    is_double: Int64
+    cameras: Int64
+    intrinsics: Pointer
+    parameters: Pointer
+    parameter_count: Int64
+    constants: Pointer
+    constant_count: Int64
+    usable: Pointer
+    safe_radius_sq: Pointer
+    image_radius_sq: Pointer
+    limits2: Pointer
+    extent: Pointer
+    table: Pointer
+    stagewise: Pointer
+    image_circle_sq: Pointer
+    chart_safe_radius_sq: Pointer
+    chart_most2: Pointer
+    chart_table: Pointer
 
 
 class Domain(Struct):
     """`Domain` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("parts", c_void_p),
-        ("part_count", c_int64),
-        ("is_double", c_int64),
-        ("cameras", c_int64),
-        ("parameters", c_void_p),
-        ("parameter_count", c_int64),
-        ("constants", c_void_p),
-        ("constant_count", c_int64),
-        ("is_chart", c_int64),
-        ("is_radial", c_int64),
-        ("ends", c_void_p),
-        ("usual_ends", c_void_p),
-        ("folds", c_void_p),
-        ("most", c_double),
-        ("radii", c_void_p),
-        ("coarse", c_void_p),
-        ("even", c_void_p),
-        ("safe_radius_sq", c_void_p),
-        ("image_radius_sq", c_void_p),
-        ("image_circle_sq", c_void_p),
-        ("table", c_void_p),
-        ("limits2", c_void_p),
-        ("extent", c_void_p),
-        ("stagewise", c_void_p),
-    )
-    parts: int | None
-    part_count: int
-    is_double: int
-    cameras: int
-    parameters: int | None
-    parameter_count: int
-    constants: int | None
-    constant_count: int
-    is_chart: int
-    is_radial: int
-    ends: int | None
-    usual_ends: int | None
-    folds: int | None
-    most: float
-    radii: int | None
-    coarse: int | None
-    even: int | None
-    safe_radius_sq: int | None
-    image_radius_sq: int | None
-    image_circle_sq: int | None
-    table: int | None
-    limits2: int | None
-    extent: int | None
-    stagewise: int | None
+    parts: Pointer
+    part_count: Int64
+    is_double: Int64
+    cameras: Int64
+    parameters: Pointer
+    parameter_count: Int64
+    constants: Pointer
+    constant_count: Int64
+    is_chart: Int64
+    is_radial: Int64
+    ends: Pointer
+    usual_ends: Pointer
+    folds: Pointer
+    most: Double
+    radii: Pointer
+    coarse: Pointer
+    even: Pointer
+    safe_radius_sq: Pointer
+    image_radius_sq: Pointer
+    image_circle_sq: Pointer
+    table: Pointer
+    limits2: Pointer
+    extent: Pointer
+    stagewise: Pointer
 
 
 class Rows(Struct):
     """`Rows` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("cameras", c_void_p),
-        ("rows", c_void_p),
-        ("row_strides", c_int64 * 3),
-        ("results", c_void_p),
-        ("result_strides", c_int64 * 3),
-        ("valid", c_void_p),
-        ("solution", c_void_p),
-        ("cotangents", c_void_p),
-        ("cotangent_strides", c_int64 * 3),
-        ("sums", c_void_p),
-        ("count", c_int64),
-        ("tile", c_int64),
-        ("direction", c_int64),
-        ("next", c_void_p),
-    )
-    cameras: int | None
-    rows: int | None
-    row_strides: Numbers
-    results: int | None
-    result_strides: Numbers
-    valid: int | None
-    solution: int | None
-    cotangents: int | None
-    cotangent_strides: Numbers
-    sums: int | None
-    count: int
-    tile: int
-    direction: int
-    next: int | None
+    cameras: Pointer
+    rows: Pointer
+    row_strides: Annotated[Numbers, c_int64 * 3]
+    results: Pointer
+    result_strides: Annotated[Numbers, c_int64 * 3]
+    valid: Pointer
+    solution: Pointer
+    cotangents: Pointer
+    cotangent_strides: Annotated[Numbers, c_int64 * 3]
+    sums: Pointer
+    count: Int64
+    tile: Int64
+    direction: Int64
+    next: Pointer
 
 
 class Move(Struct):
     """`Move` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("from_", c_void_p),
-        ("to", c_void_p),
-        ("turns", c_void_p),
-        ("turn_strides", c_int64 * 3),
-        ("cameras", c_int64),
-        ("form", c_int64),
-        ("height", c_double),
-        ("width", c_double),
-        ("rows", c_void_p),
-        ("row_strides", c_int64 * 3),
-        ("results", c_void_p),
-        ("result_strides", c_int64 * 3),
-        ("valid", c_void_p),
-        ("count", c_int64),
-        ("tile", c_int64),
-        ("next", c_void_p),
-    )
-    from_: int | None
-    to: int | None
-    turns: int | None
-    turn_strides: Numbers
-    cameras: int
-    form: int
-    height: float
-    width: float
-    rows: int | None
-    row_strides: Numbers
-    results: int | None
-    result_strides: Numbers
-    valid: int | None
-    count: int
-    tile: int
-    next: int | None
+    from_: Pointer
+    to: Pointer
+    turns: Pointer
+    turn_strides: Annotated[Numbers, c_int64 * 3]
+    cameras: Int64
+    form: Int64
+    height: Double
+    width: Double
+    rows: Pointer
+    row_strides: Annotated[Numbers, c_int64 * 3]
+    results: Pointer
+    result_strides: Annotated[Numbers, c_int64 * 3]
+    valid: Pointer
+    count: Int64
+    tile: Int64
+    next: Pointer
 
 
 class Lattices(Struct):
     """`Lattices` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("move", Move),
-        ("cells", Classification),
-        ("first_row", c_int64),
-        ("learns", c_int64),
-        ("narrow", c_void_p),
-        ("exact", c_void_p),
-        ("used", c_void_p),
-        ("jobs", c_void_p),
-        ("job_count", c_int64),
-    )
     move: Move
     cells: Classification
-    first_row: int
-    learns: int
-    narrow: int | None
-    exact: int | None
-    used: int | None
-    jobs: int | None
-    job_count: int
+    first_row: Int64
+    learns: Int64
+    narrow: Pointer
+    exact: Pointer
+    used: Pointer
+    jobs: Pointer
+    job_count: Int64
 
 
 class Turned(Struct):
     """`Turned` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("turn", c_void_p),
-        ("rows", c_void_p),
-        ("results", c_void_p),
-        ("strides", c_int64 * 2),
-        ("count", c_int64),
-        ("is_double", c_int64),
-        ("form", c_int64),
-    )
-    turn: int | None
-    rows: int | None
-    results: int | None
-    strides: Numbers
-    count: int
-    is_double: int
-    form: int
+    turn: Pointer
+    rows: Pointer
+    results: Pointer
+    strides: Annotated[Numbers, c_int64 * 2]
+    count: Int64
+    is_double: Int64
+    form: Int64
 
 
 class Together(Struct):
     """`Together` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("jobs", c_void_p),
-        ("job_count", c_int64),
-        ("is_whole", c_int64),
-        ("moves", c_void_p),
-        ("move_count", c_int64),
-        ("turned", c_void_p),
-        ("turned_count", c_int64),
-        ("lattices", Lattices),
-    )
-    jobs: int | None
-    job_count: int
-    is_whole: int
-    moves: int | None
-    move_count: int
-    turned: int | None
-    turned_count: int
+    jobs: Pointer
+    job_count: Int64
+    is_whole: Int64
+    moves: Pointer
+    move_count: Int64
+    turned: Pointer
+    turned_count: Int64
     lattices: Lattices
 
 
@@ -610,255 +400,139 @@ class Draws(Struct):
     """`Draws` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("values", c_void_p),
-        ("first", c_int64 * 10),
-        ("cameras", c_int64),
-        ("count", c_int64),
-        ("height", c_double),
-        ("width", c_double),
-        ("is_each", c_int64),
-        ("sized", c_void_p),
-        ("reach", c_void_p),
-        ("coefficients", c_void_p),
-        ("sensitivity", c_void_p),
-        ("ends", c_void_p),
-        ("base", c_void_p),
-        ("border", c_void_p),
-        ("places", c_void_p),
-        ("domain", Domain),
-        ("tries", c_void_p),
-        ("tried", c_void_p),
-        ("allowed", c_void_p),
-        ("share", c_double),
-        ("source", c_void_p),
-        ("source_height", c_double),
-        ("source_width", c_double),
-        ("looked_at", c_void_p),
-        ("factors", c_void_p),
-        ("filled", c_void_p),
-        ("room", c_void_p),
-        ("made", Cameras),
-        ("rotations", c_void_p),
-        ("distortion", c_void_p),
-        ("followed", c_int64),
-    )
-    values: int | None
-    first: Numbers
-    cameras: int
-    count: int
-    height: float
-    width: float
-    is_each: int
-    sized: int | None
-    reach: int | None
-    coefficients: int | None
-    sensitivity: int | None
-    ends: int | None
-    base: int | None
-    border: int | None
-    places: int | None
+    values: Pointer
+    first: Annotated[Numbers, c_int64 * 10]
+    cameras: Int64
+    count: Int64
+    height: Double
+    width: Double
+    is_each: Int64
+    sized: Pointer
+    reach: Pointer
+    coefficients: Pointer
+    sensitivity: Pointer
+    ends: Pointer
+    base: Pointer
+    border: Pointer
+    places: Pointer
     domain: Domain
-    tries: int | None
-    tried: int | None
-    allowed: int | None
-    share: float
-    source: int | None
-    source_height: float
-    source_width: float
-    looked_at: int | None
-    factors: int | None
-    filled: int | None
-    room: int | None
+    tries: Pointer
+    tried: Pointer
+    allowed: Pointer
+    share: Double
+    source: Pointer
+    source_height: Double
+    source_width: Double
+    looked_at: Pointer
+    factors: Pointer
+    filled: Pointer
+    room: Pointer
     made: Cameras
-    rotations: int | None
-    distortion: int | None
-    followed: int
+    rotations: Pointer
+    distortion: Pointer
+    followed: Int64
 
 
 class Poses(Struct):
     """`Poses` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("cameras", c_void_p),
-        ("points", c_void_p),
-        ("rays", c_void_p),
-        ("pixels", c_void_p),
-        ("weights", c_void_p),
-        ("point_rows", c_int64),
-        ("row_count", c_int64),
-        ("count", c_int64),
-        ("task", c_int64),
-        ("loss", c_int64),
-        ("steps", c_int64),
-        ("loss_scale", c_double),
-        ("settled", c_double),
-        ("nothing", c_double),
-        ("damping", c_double),
-        ("threshold", c_double),
-        ("rotations", c_void_p),
-        ("translations", c_void_p),
-        ("valid", c_void_p),
-        ("costs", c_void_p),
-        ("vectors", c_void_p),
-        ("rms", c_void_p),
-        ("inliers", c_void_p),
-        ("covariance", c_void_p),
-        ("next", c_void_p),
-        ("left", c_void_p),
-    )
-    cameras: int | None
-    points: int | None
-    rays: int | None
-    pixels: int | None
-    weights: int | None
-    point_rows: int
-    row_count: int
-    count: int
-    task: int
-    loss: int
-    steps: int
-    loss_scale: float
-    settled: float
-    nothing: float
-    damping: float
-    threshold: float
-    rotations: int | None
-    translations: int | None
-    valid: int | None
-    costs: int | None
-    vectors: int | None
-    rms: int | None
-    inliers: int | None
-    covariance: int | None
-    next: int | None
-    left: int | None
+    cameras: Pointer
+    points: Pointer
+    rays: Pointer
+    pixels: Pointer
+    weights: Pointer
+    point_rows: Int64
+    row_count: Int64
+    count: Int64
+    task: Int64
+    loss: Int64
+    steps: Int64
+    loss_scale: Double
+    settled: Double
+    nothing: Double
+    damping: Double
+    threshold: Double
+    rotations: Pointer
+    translations: Pointer
+    valid: Pointer
+    costs: Pointer
+    vectors: Pointer
+    rms: Pointer
+    inliers: Pointer
+    covariance: Pointer
+    next: Pointer
+    left: Pointer
 
 
 class Views(Struct):
     """`Views` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("cameras", c_void_p),
-        ("points", c_void_p),
-        ("point_strides", c_int64 * 2),
-        ("rotations", c_void_p),
-        ("translations", c_void_p),
-        ("pixels", c_void_p),
-        ("given", c_void_p),
-        ("residuals", c_void_p),
-        ("weights", c_void_p),
-        ("valid", c_void_p),
-        ("costs", c_void_p),
-        ("problems", c_int64),
-        ("views", c_int64),
-        ("count", c_int64),
-        ("loss", c_int64),
-        ("loss_scale", c_double),
-        ("learnt", c_void_p),
-        ("columns", c_int64),
-        ("view", c_void_p),
-        ("shared", c_void_p),
-        ("left", c_void_p),
-    )
-    cameras: int | None
-    points: int | None
-    point_strides: Numbers
-    rotations: int | None
-    translations: int | None
-    pixels: int | None
-    given: int | None
-    residuals: int | None
-    weights: int | None
-    valid: int | None
-    costs: int | None
-    problems: int
-    views: int
-    count: int
-    loss: int
-    loss_scale: float
-    learnt: int | None
-    columns: int
-    view: int | None
-    shared: int | None
-    left: int | None
+    cameras: Pointer
+    points: Pointer
+    point_strides: Annotated[Numbers, c_int64 * 2]
+    rotations: Pointer
+    translations: Pointer
+    pixels: Pointer
+    given: Pointer
+    residuals: Pointer
+    weights: Pointer
+    valid: Pointer
+    costs: Pointer
+    problems: Int64
+    views: Int64
+    count: Int64
+    loss: Int64
+    loss_scale: Double
+    learnt: Pointer
+    columns: Int64
+    view: Pointer
+    shared: Pointer
+    left: Pointer
 
 
 class Steps(Struct):
     """`Steps` of the headers."""
 
     __slots__ = ()
-    _fields_ = (
-        ("view", c_void_p),
-        ("shared", c_void_p),
-        ("damping", c_void_p),
-        ("problems", c_int64),
-        ("views", c_int64),
-        ("width", c_int64),
-        ("columns", c_int64),
-        ("of_views", c_void_p),
-        ("of_shared", c_void_p),
-        ("rest", c_void_p),
-        ("left", c_void_p),
-    )
-    view: int | None
-    shared: int | None
-    damping: int | None
-    problems: int
-    views: int
-    width: int
-    columns: int
-    of_views: int | None
-    of_shared: int | None
-    rest: int | None
-    left: int | None
+    view: Pointer
+    shared: Pointer
+    damping: Pointer
+    problems: Int64
+    views: Int64
+    width: Int64
+    columns: Int64
+    of_views: Pointer
+    of_shared: Pointer
+    rest: Pointer
+    left: Pointer
 
 
 STRUCTS = Agreement, Job, Images, Classification, Laying, Part, Cameras, Domain, Rows, Move, Lattices, Turned, Together, Draws, Poses, Views, Steps
+for struct in STRUCTS:
+    struct.lay_out()
 
 
 class Library(Calls):
     """The compiled library."""
 
-    types = {
-        "camtorch_sample": (c_int32, [POINTER(Job)]),
-        "camtorch_sample_images": (None, [POINTER(Images)]),
-        "camtorch_classify": (c_int32, [POINTER(Classification)]),
-        "camtorch_lay": (None, [POINTER(Laying)]),
-        "camtorch_geometry": (c_int64, [POINTER(Rows)]),
-        "camtorch_moves": (c_int64, [POINTER(Move)]),
-        "camtorch_lattices": (c_int64, [POINTER(Lattices)]),
-        "camtorch_domain": (None, [POINTER(Domain)]),
-        "camtorch_draws": (c_int64, [POINTER(Draws)]),
-        "camtorch_consensus": (None, [POINTER(Agreement)]),
-        "camtorch_poses": (None, [POINTER(Poses)]),
-        "camtorch_views": (None, [POINTER(Views)]),
-        "camtorch_steps": (None, [POINTER(Steps)]),
-        "camtorch_use": (c_int32, [c_char_p]),
-        "camtorch_sources": (c_uint32, []),
-        "camtorch_layout": (c_uint32, []),
-        "camtorch_variant": (c_char_p, []),
-        "camtorch_turns": (None, [c_void_p, c_int64, c_void_p, c_int64]),
-        "camtorch_together": (c_int64, [POINTER(Together)]),
-    }
-    camtorch_sample: Callable[[Job], int]
-    camtorch_sample_images: Callable[[Images], None]
-    camtorch_classify: Callable[[Classification], int]
-    camtorch_lay: Callable[[Laying], None]
-    camtorch_geometry: Callable[[Rows], int]
-    camtorch_moves: Callable[[Move], int]
-    camtorch_lattices: Callable[[Lattices], int]
-    camtorch_domain: Callable[[Domain], None]
-    camtorch_draws: Callable[[Draws], int]
-    camtorch_consensus: Callable[[Agreement], None]
-    camtorch_poses: Callable[[Poses], None]
-    camtorch_views: Callable[[Views], None]
-    camtorch_steps: Callable[[Steps], None]
-    camtorch_use: Callable[[bytes], int]
-    camtorch_sources: Callable[[], int]
-    camtorch_layout: Callable[[], int]
-    camtorch_variant: Callable[[], bytes]
-    camtorch_turns: Callable[[int, int, int, int], None]
-    camtorch_together: Callable[[Together], int]
+    camtorch_sample: Callable[[Job], Int32]
+    camtorch_sample_images: Callable[[Images], Void]
+    camtorch_classify: Callable[[Classification], Int32]
+    camtorch_lay: Callable[[Laying], Void]
+    camtorch_geometry: Callable[[Rows], Int64]
+    camtorch_moves: Callable[[Move], Int64]
+    camtorch_lattices: Callable[[Lattices], Int64]
+    camtorch_domain: Callable[[Domain], Void]
+    camtorch_draws: Callable[[Draws], Int64]
+    camtorch_consensus: Callable[[Agreement], Void]
+    camtorch_poses: Callable[[Poses], Void]
+    camtorch_views: Callable[[Views], Void]
+    camtorch_steps: Callable[[Steps], Void]
+    camtorch_use: Callable[[Text], Int32]
+    camtorch_sources: Callable[[], Unsigned]
+    camtorch_layout: Callable[[], Unsigned]
+    camtorch_variant: Callable[[], Text]
+    camtorch_turns: Callable[[Pointer, Int64, Pointer, Int64], Void]
+    camtorch_together: Callable[[Together], Int64]

@@ -42,7 +42,7 @@ def signed(content, oldest=11):
 def library(target, needs=b"GLIBC_2.17\0", numbers=None):
     """The bytes of a library as `check_library` reads them: header, names of its calls, checksums."""
     numbers = numbers or [building.checksum(), structs.CHECKSUM, *offsets(structs.STRUCTS)]
-    content = b"".join(name.encode() + b"\0" for name in structs.Library.types) + struct.pack(
+    content = b"".join(name.encode() + b"\0" for name in structs.Library.__annotations__) + struct.pack(
         f"<{len(numbers)}I", *numbers
     )
     content += needs + bytes(9000)
