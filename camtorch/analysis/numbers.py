@@ -1,7 +1,5 @@
 """Numbers of a camera, and the distance of two cameras' pixels for the same rays."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The command `camtorch calibrate`: from photographs or a video of a board to the file of a camera, or of a rig."""
 
-from __future__ import annotations
-
 import argparse
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The cameras of a calibration file, chosen by options, and their model."""
 
-from __future__ import annotations
-
 import argparse
 import warnings
 from collections.abc import Iterable, Sequence

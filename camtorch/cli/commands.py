@@ -1,7 +1,5 @@
 """The commands and their options. Imports are light: the modules of a command are imported when it runs."""
 
-from __future__ import annotations
-
 import argparse
 import glob
 import os

@@ -1,7 +1,5 @@
 """The command `camtorch convert`: a calibration as another camera model, or in another format."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import math

@@ -1,7 +1,5 @@
 """The command `camtorch dewarp`: remove the lens distortion of photographs and videos, one or many."""
 
-from __future__ import annotations
-
 import argparse
 import os
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Image files written from arrays, by Pillow."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

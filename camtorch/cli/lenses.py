@@ -1,7 +1,5 @@
 """The command `camtorch lenses`: lenses that exist, by their names."""
 
-from __future__ import annotations
-
 import argparse
 
 from camtorch import lenses

@@ -1,7 +1,5 @@
 """The command line `camtorch`: running commands and showing errors."""
 
-from __future__ import annotations
-
 import argparse
 import gc
 import importlib

@@ -1,7 +1,5 @@
 """The command `camtorch map`: a dewarping as a lookup table for another runtime, with its error."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

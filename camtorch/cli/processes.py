@@ -1,7 +1,5 @@
 """Processes that make files, one thread each, and the outcome of each file."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Views of a board for `camtorch calibrate`: images taken together, and sharp frames of a video."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence

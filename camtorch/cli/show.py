@@ -1,7 +1,5 @@
 """The command `camtorch show`: a calibration in numbers and as an image."""
 
-from __future__ import annotations
-
 import argparse
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Input and output files of a command: output files that cannot be written are refused before the work."""
 
-from __future__ import annotations
-
 import glob
 import os
 import sys

@@ -1,7 +1,5 @@
 """Lines on stderr: notes, errors with their reasons, and progress by tqdm."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Videos through warps, by PyAV: time stamps, sound and subtitles are kept."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Callable, Iterator

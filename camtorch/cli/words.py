@@ -1,7 +1,5 @@
 """Types of option values for argparse."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import re

@@ -1,7 +1,5 @@
 """Cameras as columns of numbers, one row a sample, for tables that hold no objects."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Results of face and body detectors as fields of a sample; the detectors themselves are not imported."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

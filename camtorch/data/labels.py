@@ -1,7 +1,5 @@
 """Label files of data sets as samples: COCO's keypoints, WFLW, 300W, 300W-LP, and OpenLABEL as the DMD has it."""
 
-from __future__ import annotations
-
 import functools
 import json
 import operator

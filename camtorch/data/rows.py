@@ -1,7 +1,5 @@
 """Rows and samples of arrays, moved one by one, as called by Ray Data's `map_batches` and WebDataset's `map`."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from typing import Any

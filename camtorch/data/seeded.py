@@ -1,7 +1,5 @@
 """Draws that depend only on the key of a sample, not on its batch, its worker or earlier samples."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Project Aria's device calibration JSON."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

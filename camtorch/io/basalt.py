@@ -1,7 +1,5 @@
 """Basalt's calibration: JSON as cereal writes it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from camtorch.cameras.rig import Rig

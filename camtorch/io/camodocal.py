@@ -1,7 +1,5 @@
 """camodocal's camera files, also those of KITTI-360's fisheyes and of VINS: YAML of one camera."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from camtorch.cameras.rig import Rig

@@ -1,7 +1,5 @@
 """camtorch's own JSON, which holds any camera of any model to the last bit."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping
 from typing import Any, TypeVar

@@ -3,8 +3,6 @@
 COLMAP puts pixel centres at 0.5. Its poses are camera from world, as in camtorch.
 """
 
-from __future__ import annotations
-
 import codecs
 import os
 import re

@@ -8,8 +8,6 @@ To add a format, write a file in this folder and name it in one of the lists bel
 Values that it cannot read or hold raise CameraFileError, as by `record.fail`.
 """
 
-from __future__ import annotations
-
 import codecs
 import fnmatch
 import json

@@ -1,7 +1,5 @@
 """Gyroflow's lens profiles: JSON with the matrix and the coefficients of OpenCV."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from camtorch.cameras.rig import Rig

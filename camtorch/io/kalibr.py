@@ -1,7 +1,5 @@
 """Kalibr's camchain: cam0, cam1, ... each with its pose relative to the one before, or to the IMU."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from typing import Any

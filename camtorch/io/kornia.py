@@ -1,7 +1,5 @@
 """kornia's cameras as camtorch's. `import camtorch` does not load kornia."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Agisoft Metashape's XML: a calibration, or sensors and posed cameras; pixel centres at 0.5, p1 and p2 exchanged."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from typing import Any

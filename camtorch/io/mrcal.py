@@ -1,7 +1,5 @@
 """mrcal's .cameramodel, a Python literal, read as YAML: texts have no escapes."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

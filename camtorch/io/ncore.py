@@ -1,7 +1,5 @@
 """NVIDIA's ncore: JSON of one camera, as `encode_camera_model_parameters` of nvidia-ncore gives it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Nerfstudio's transforms.json: pixel centres at 0.5, cameras with y up and z back, poses camera-to-world."""
 
-from __future__ import annotations
-
 import math
 from array import array
 from typing import Any

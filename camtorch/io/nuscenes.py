@@ -1,7 +1,5 @@
 """nuScenes' and nuImages' `calibrated_sensor.json`: all cameras of all drives, with the channels of `sensor.json`."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections import Counter

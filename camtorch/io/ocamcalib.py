@@ -3,8 +3,6 @@
 The second line, a polynomial close to the inverse of the first, is not read: the camera inverts the first exactly.
 """
 
-from __future__ import annotations
-
 import re
 
 from camtorch.cameras.rig import Rig

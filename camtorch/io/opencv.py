@@ -1,7 +1,5 @@
 """OpenCV's cameras or stereo pairs: YAML, JSON or XML of `cv2.FileStorage`, and archives of `numpy.savez`."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

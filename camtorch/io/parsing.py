@@ -3,8 +3,6 @@
 To refuse 10 MB takes at most a second and ten times that memory. All functions raise CameraFileError to refuse.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Image files as they are stored, as calibrations need them. Pillow turns only TIFFs by their orientation."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

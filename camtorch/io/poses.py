@@ -1,7 +1,5 @@
 """Conversion of poses in files, matrices or quaternions, to `Extrinsics` in float64 and back."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

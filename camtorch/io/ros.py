@@ -1,7 +1,5 @@
 """ROS camera_info: the YAML of camera_calibration, or a message as `rostopic echo` prints it."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

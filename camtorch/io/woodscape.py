@@ -1,7 +1,5 @@
 """WoodScape's calibrations: JSON of one camera, a polynomial of the angle in pixels, the pose vehicle from camera."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from camtorch.cameras.rig import Rig

@@ -1,7 +1,5 @@
 """Writing files as a whole or not at all (`replacing`), exact numbers, and errors for values that would be lost."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

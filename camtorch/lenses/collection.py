@@ -5,8 +5,6 @@ fx, the principal point relative to the image's middle, each with its sign as th
 column one plane after another.
 """
 
-from __future__ import annotations
-
 import difflib
 import re
 import unicodedata

@@ -1,7 +1,5 @@
 """Real lenses to draw from, scaled to the size of an image so that every pixel has a ray."""
 
-from __future__ import annotations
-
 import math
 from functools import cache, lru_cache
 from typing import NamedTuple

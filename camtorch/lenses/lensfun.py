@@ -1,7 +1,5 @@
 """Lenses of lensfun's database, read by your own `lensfunpy`; camtorch includes no part of it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The f-theta fisheye camera from the pixel to the angle: theta = r (1 + k2 r + k3 r^2 + ...)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from torch import Tensor

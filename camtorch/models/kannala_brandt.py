@@ -1,7 +1,5 @@
 """The Kannala-Brandt fisheye camera, OpenCV's: r = theta (1 + k1 theta^2 + k2 theta^4 + ...)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

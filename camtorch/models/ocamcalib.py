@@ -1,7 +1,5 @@
 """OCamCalib's omnidirectional camera, from the pixel to the ray: (x, y, 1 + a1 r + a2 r^2 + ...)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from types import MappingProxyType
 from typing import ClassVar

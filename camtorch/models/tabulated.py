@@ -1,7 +1,5 @@
 """The camera whose r(theta) is a table, as provided by lens vendors."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """The fisheye of the WoodScape data set: r = theta (1 + k2 theta + k3 theta^2 + k4 theta^3)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import ClassVar
 

@@ -7,8 +7,6 @@ again if its text, without comments, that of its headers, the options or the com
 `CAMTORCH_VARIANTS=baseline` compiles for one kind of CPU, to try out a change.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import platform

@@ -3,8 +3,6 @@
 The build, which needs no package, runs this file for `layout.h`, by which a library says what it was built with.
 """
 
-from __future__ import annotations
-
 import keyword
 import re
 import zlib

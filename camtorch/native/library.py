@@ -1,7 +1,5 @@
 """The compiled library: which one is loaded, or why none is."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import os

@@ -1,7 +1,5 @@
 """Memory of large results, which is used again: memory that is new to a process takes as long to get as to sample."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import math

@@ -1,7 +1,5 @@
 """Calls of the native sampler: tensors to the pointers and sizes that it takes, and its tiles to threads."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Sequence

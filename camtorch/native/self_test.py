@@ -1,7 +1,5 @@
 """Calls of the compiled library whose answers are known: it gives them before it is used."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from ctypes import Array, c_double, c_float, c_int32, c_int64, c_uint8

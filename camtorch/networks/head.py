@@ -1,7 +1,5 @@
 """The layer that turns features into valid cameras."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Collection, Sequence

@@ -1,7 +1,5 @@
 """Limits of a lens's coefficients, beyond which it would fold or bend too much on an image."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Losses between cameras, for networks that predict them: on rays, and on pixels."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Literal, TypedDict, overload

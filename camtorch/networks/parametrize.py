@@ -1,7 +1,5 @@
 """Parametrizations of a camera's intrinsics, for `torch.nn.utils.parametrize`: positive, and tied to each other."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """The camera that a `CameraHead` starts from, and the largest discs of the lens that its images show."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

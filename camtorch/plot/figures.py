@@ -1,7 +1,5 @@
 """Plots of cameras, of the difference of two, of rigs, and of calibrations with their uncertainty."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import cycle

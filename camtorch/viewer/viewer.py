@@ -4,8 +4,6 @@ The files in this folder become one text, with the camera, the photograph and th
 `formulas.js` has the camera models, `drawing.js` the drawing and controls, `presets.json` a camera of every model.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import os
