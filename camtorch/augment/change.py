@@ -27,6 +27,7 @@ from camtorch.warp.options import Mode, Options, as_fill
 from camtorch.warp.panorama import seam_of
 from camtorch.warp.warp import Warp
 
+_NO_TURN = np.eye(3)
 _HALF = 5e-3  # absolute: rotations that were half precision on the way are the same ones
 _ROUNDED = 1e-5  # relative: cameras that were float32 on the way are the same ones
 TensorOrPair = TypeVar("TensorOrPair", Tensor, tuple[Tensor, Tensor])
@@ -82,6 +83,12 @@ class LazyWarp:
         intrinsics, distortion = torch.from_numpy(numbers.copy()).as_subclass(nn.Parameter), torch.from_numpy(k.copy())
         distortion = distortion.as_subclass(nn.Parameter) if k.shape[-1] else distortion
         return remade(self.like, intrinsics=intrinsics, distortion=distortion, image_size=self.image_size)
+
+    def new_rotation(self) -> Tensor:
+        """Return the rotation (3, 3) of one, in memory of its own; numpy copies it in less time than torch."""
+        if self.rotation is None:
+            return torch.from_numpy(_NO_TURN.astype(self.intrinsics.dtype))
+        return torch.from_numpy(self.rotation.numpy().copy())
 
     def transform_positions(self, points: Tensor) -> Tensor:
         """Return points (B, *N, 3) of the source's frame in the target's."""
@@ -302,6 +309,8 @@ class Change:
         rotation = None if moves is None else moves.rotation
         if batched or self.gate is not None or (rotation is not None and rotation.ndim > 2):
             return (self.rotation if batched else self.rotation[0]).clone()
+        if isinstance(moves, LazyWarp):
+            return moves.new_rotation()
         return _eye(self.parts[0].camera.intrinsics) if rotation is None else rotation.clone()
 
     several: Camera = _renamed("several", "camera_for_sample", batched=True)

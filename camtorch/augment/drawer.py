@@ -12,7 +12,7 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
-from camtorch.augment.change import LazyWarp, Part
+from camtorch.augment.change import Part
 from camtorch.augment.devices import twin_of
 from camtorch.augment.filling import enough, scaled, tell_of_narrow_images
 from camtorch.augment.jitter import jittered
@@ -21,7 +21,7 @@ from camtorch.augment.presets import REAL, as_like
 from camtorch.augment.ranges import Draw, Range, RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.tensors import are_numbers, hold_numbers, known_false, with_derivatives_of
+from camtorch.evaluate.tensors import hold_numbers, known_false, with_derivatives_of
 from camtorch.lenses.drawing import covering, drawn
 from camtorch.models import KannalaBrandt, Pinhole
 from camtorch.optics.radial_inverse import precise
@@ -158,44 +158,48 @@ class CameraDrawer(Augmentation):
 
     def _part(self, source: Camera, draw: Draw) -> Part:
         values = self._values_for(source, draw)
-        made = self._lazy_warp(source, values)
-        if made is None:
+        # a draw is of tensors where something is recorded
+        start = None if isinstance(draw["apply"], Tensor) else self._start(source, values)
+        if start is None:
             return self._part_by_torch(source, values)
+        has_own_lens = self._is_real or self.like is not None
+        made = start.warp(values, start.base if has_own_lens else source, self._warp_options)
         if self.min_filled and (min(made.filled, default=1) < self.min_filled or max(made.zooms, default=1) > 1):
-            self._tell_of(source, lambda: made.target, torch.tensor(made.zooms), torch.tensor(made.filled))
-        may_stay_lazy = made.target_native is not None and self.options["tolerance"] and not self.options["antialias"]
+            self._tell_of(source, lambda: made.target, torch.tensor([*made.zooms]), torch.tensor([*made.filled]))
+        options = self.options
+        may_stay_lazy = made.target_native is not None and options["tolerance"] and not options["antialias"]
         if may_stay_lazy and self.beside_the_camera.isdisjoint(self.ranges):
             return Part(source, made)  # of numbers, which become a `Warp` at first use
         return self._part_between(source, made.target, made.rotation, values)
 
-    def _lazy_warp(self, source: Camera, values: Mapping[str, Any]) -> LazyWarp | None:
-        """Return the warp of a draw by native code; None if something is recorded, or that lacks a model."""
-        like = None if self.like is None else self._like_for(source)
-        tensors = (source.intrinsics, source.distortion) if like is None else (*source.tensors, *like.tensors)
-        # floats and arrays are drawn only if nothing is recorded; with no range at all, ask
-        first = next(iter(values.values()), None)
-        if isinstance(first, Tensor) or (first is None and not are_numbers()) or not hold_numbers(tensors):
+    def _start(self, source: Camera, values: Mapping[str, Any]) -> Start | None:
+        """Return what native code starts from for values of these names, kept while the cameras' numbers stay.
+
+        None if a camera learns, or native code lacks a range or a model.
+        """
+        like = self._like_for(source)
+        tensors = source.tensors if like is None else source.tensors + like.tensors
+        if not hold_numbers(tensors):
             return None
         if self._is_real:  # each draw has a lens of its own
-            start = self._start(source, values)
-        else:
-            # all else that new cameras depend on
-            sizes = source.image_size, None if like is None else like.image_size
-            key = "start", type(source), *sizes, self._calls.revision, self.ranges.get("fov"), self.min_filled, *values
-            known = self._memo.entry(tensors, key)
-            start = self._memo(tensors, key, partial(self._start, source, values)) if known is None else known.result
-        if start is None:
-            return None
-        return start.warp(values, source if like is None and not self._is_real else start.base, self._warp_options)
+            return self._new_start(source, values)
+        # all else that new cameras depend on
+        sizes = source.image_size, None if like is None else like.image_size
+        key = "start", type(source), *sizes, self._calls.revision, self.ranges.get("fov"), self.min_filled, *values
+        known = self._memo.entry(tensors, key)
+        if known is None:
+            return self._memo(tensors, key, partial(self._new_start, source, values))
+        start: Start | None = known.result
+        return start
 
-    def _start(self, source: Camera, values: Mapping[str, Any]) -> Start | None:
-        """Return what native code starts from for values of these names; None if it lacks a range, or a model."""
+    def _new_start(self, source: Camera, values: Mapping[str, Any]) -> Start | None:
         if not self._keeps_formulas:
             return None
         names = values.keys() - self.beside_the_camera - {"lens"}
         base, sized, covered_radius = self._lens_for(source.detach().clone(), values.get("lens"))
-        jitters, size = "distortion" in values and base.distortion.shape[-1] > 0, self._size_of(source)
-        nominal = self._nominal(base, sized, size, values) if jitters else None
+        size, nominal = self._size_of(source), None
+        if "distortion" in values and base.distortion.shape[-1] > 0:
+            nominal = self._nominal(base, sized, size, values)
         return Start.of(Wanted(source, base, sized, covered_radius, size, names, nominal, self.min_filled, self._name))
 
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
@@ -286,8 +290,10 @@ class CameraDrawer(Augmentation):
 
     def _like_for(self, source: Camera) -> Camera | None:
         """Return `like`, on the CPU if the source is there and its numbers are known; None without `like`."""
-        like = self.like
-        return like if like is None or not source.intrinsics.is_cpu else twin_of(like) or like
+        like: Any = self._modules.get("like")  # found in less time than by the attribute
+        if like is None or like.intrinsics.is_cpu or not source.intrinsics.is_cpu:
+            return like  # type: ignore[no-any-return]
+        return twin_of(like) or like
 
     def _size_of(self, source: Camera) -> tuple[int, int]:
         return self.image_size or source.size_for(self._name)

@@ -1,8 +1,11 @@
 """New cameras of drawn numbers, by native code; `new_camera` in `drawer.py` has the same formulas in torch.
 
 A `Start` holds all that is the same for each draw: the source, the base, and the struct that C reads, with their
-numbers; `native/draws.h` describes its fields. `warp` copies the struct, points it to the values of a draw and to room
-for the new cameras, and calls C.
+numbers; `native/draws.h` describes its fields. `Start.warp` then draws in four steps: it copies the struct, packs the
+values of a draw, has C write the new cameras, and reads these.
+
+The lens of a new camera is that of the base, unless its coefficients are jittered. Then C makes it, or if C cannot
+compute where such a lens ends, Python makes candidates, and C chooses among them.
 """
 
 from __future__ import annotations
@@ -45,6 +48,8 @@ DRAWN_KINDS = {
     "place": (structs.PLACE, 2),
 }
 _TURNS = {"yaw", "pitch", "roll"}
+# How many numbers C writes for a camera, before its coefficients
+_INTRINSICS, _ROTATION = 4, 9
 
 
 @lru_cache(maxsize=64)
@@ -95,43 +100,58 @@ class Start:
 
     def __init__(self, wanted: Wanted, source_native: Native, base_native: Native):
         """Start from the source and the base as native code takes them: `source_native` and `base_native`."""
-        source, base, size = wanted.source, wanted.base, wanted.size
-        self.base, self._source_native, self._base_native, self._size = base, source_native, base_native, size
-        self._owner = wanted.owner
+        source, base = wanted.source, wanted.base
+        self.base, self._source_native, self._base_native = base, source_native, base_native
+        self._size, self._owner = wanted.size, wanted.owner
         self._is_flat = source.turn_axis is None and base.turn_axis is None
         self._batch = tuple(wanted.sized.shape[:-1]) or base.batch_shape  # (B,) if each camera has a lens of its own
         self._distortion = base.distortion.detach()
-        call = self._call = structs.Draws(count=self._distortion.shape[-1], height=size[0], width=size[1])
-        # The base: new cameras have its lens, which is copied with its table, for those that unproject
-        base_native.add_table()
-        call.base, call.made, call.made.usable = base_native.pointer, base_native.struct, None
-        call.is_each, call.sized = bool(self._batch), self._keep(wanted.sized)
-        call.reach = None if wanted.covered_radius is None else self._keep(wanted.covered_radius.double())
-        # The source: C looks at it only where new images have to be filled
-        if wanted.share:
-            source_native.add_table()
-            call.share, call.source = with_care(wanted.share), source_native.pointer
-            call.source_height, call.source_width = source.size_for("min_filled")
-            call.looked_at = self._keep(looked_at(size, base_native.dtype))
-        # The draw: where the numbers of each kind begin
-        self._names: list[str] = [name for name in DRAWN_KINDS if name in wanted.names]
-        self._drawn = 0  # how many numbers are drawn for a camera
-        call.first[:] = [-1] * structs.DRAWN_KINDS
-        for code, size_of_value in map(DRAWN_KINDS.__getitem__, self._names):
-            call.first[code] = self._drawn
-            self._drawn += size_of_value
-        # What C writes: for a camera 4 intrinsics, a rotation and coefficients; a lens that it makes takes more
-        self._room = 4 + 9 + call.count  # how many numbers
-        self._types = (c_float, np.float32) if base_native.dtype == torch.float32 else (c_double, np.float64)
-        self._needs_limits = False  # whether new lenses of an earlier call needed limits on azimuths
         self._coefficients: np.ndarray[Any, Any] = self._distortion.numpy()  # of new cameras, unless they are jittered
         self._sensitivity: Tensor | None = None  # to the values of `distortion`; None: coefficients stay
+        self._c_makes_lenses = False  # of coefficients that are jittered
+        self._needs_limits = False  # whether new lenses of an earlier call needed limits on azimuths
+        height, width = wanted.size
+        count = self._distortion.shape[-1]
+        self._call = structs.Draws(count=count, height=height, width=width)
+        self._room = _INTRINSICS + _ROTATION + count  # how many numbers C writes for a camera; a lens takes more
+        self._types = (c_float, np.float32) if base_native.dtype == torch.float32 else (c_double, np.float64)
+        self._add_base(wanted)
+        if wanted.share:
+            self._add_source(wanted.share, source)
+        self._add_values(wanted.names)
         if wanted.nominal is not None:
             self._add_coefficients(wanted.nominal)
 
     def _keep(self, tensor: Tensor, *row: int) -> int:
         """Keep a tensor, of each camera if there are several, and return where its numbers lie."""
         return self._call.keep((tensor.expand(*self._batch, *row) if self._batch and row else tensor).contiguous())
+
+    def _add_base(self, wanted: Wanted) -> None:
+        """Give new cameras the lens of the base, which is copied with its table, for those that unproject."""
+        call, native = self._call, self._base_native
+        native.add_table()
+        call.base, call.made, call.made.usable = native.pointer, native.struct, None
+        call.is_each, call.sized = bool(self._batch), self._keep(wanted.sized)
+        call.reach = None if wanted.covered_radius is None else self._keep(wanted.covered_radius.double())
+
+    def _add_source(self, share: float, source: Camera) -> None:
+        """Have C look at the source, as a share of new images has to be filled."""
+        call, native = self._call, self._source_native
+        native.add_table()
+        call.share, call.source = with_care(share), native.pointer
+        call.source_height, call.source_width = source.size_for("min_filled")
+        call.looked_at = self._keep(looked_at(self._size, self._base_native.dtype))
+
+    def _add_values(self, names: Set[str]) -> None:
+        """State where the drawn numbers of each kind begin."""
+        self._names = [name for name in DRAWN_KINDS if name in names]
+        self._turns = not _TURNS.isdisjoint(names)
+        self._drawn = 0  # how many numbers are drawn for a camera
+        self._call.first[:] = [-1] * structs.DRAWN_KINDS
+        for name in self._names:
+            code, size = DRAWN_KINDS[name]
+            self._call.first[code] = self._drawn
+            self._drawn += size
 
     def _add_coefficients(self, nominal: Tensor) -> None:
         """Have coefficients jittered, by steps that are measured on a lens of nominal intrinsics."""
@@ -150,66 +170,53 @@ class Start:
                 return
             for name, radii in native.lenses.radii_wanted().items():
                 setattr(call.domain, name, self._keep(radii))
+        self._c_makes_lenses = True
         call.places = self._keep(plan.places)
         self._room += plan.parameters + 4 + TABLE_WIDTH
 
-    def warp(self, values: Mapping[str, Any], base: Camera, options: Options) -> LazyWarp:
-        """Return the warp to cameras like `base` of values (B,) and (B, size), or numbers and lists for one."""
-        call, native, (number, dtype) = structs.Draws.from_buffer_copy(self._call), self._base_native, self._types
-        jitters, c_makes_lenses = self._sensitivity is not None, call.places is not None
-        # Point the struct to the values, and to room for what C writes
+    def warp(self, values: Mapping[str, Any], like: Camera, options: Options) -> LazyWarp:
+        """Return the warp to cameras `like` one, of values (B,) and (B, size), or numbers and lists for one."""
         packed, batch = self._packed(values)
         rows = batch[0] if batch else 1
+        number, dtype = self._types
         room = _array(number, rows * self._room)()
+        call = structs.Draws.from_buffer_copy(self._call)
         call.values, call.room = addressof(packed), addressof(room)
         call.cameras = call.made.cameras = rows
+        zooms: Any = ()
+        filled: Any = ()
         if call.share:
-            shares = _array(c_double, 2 * rows)()  # the factors, and what is filled
-            call.factors = addressof(shares)
-            call.filled = call.factors + 8 * rows
-        # C returns flags of limits and ends that it lacked. Python computes them and calls again; those of the source
-        # and the base serve all later draws
-        candidates = self._candidates(values, call) if rows and jitters and not c_makes_lenses else None
-        if self._needs_limits:
-            self._add_limits(call)
-        run = loaded().camtorch_draws
-        while (left := run(call)) & ~structs.NO_CAMERA:
-            self._complete(left, values, call, candidates)
-        if jitters and call.followed < rows:
-            call.made.limits2 = call.made.extent = None
+            zooms, filled = _array(c_double, rows)(), _array(c_double, rows)()
+            call.factors, call.filled = addressof(zooms), addressof(filled)
+        left = self._run(call, values)
         # The room holds the intrinsics of all cameras, then their rotations, coefficients, and the rest of their lenses
         numbers = np.frombuffer(room, dtype)  # numpy cuts it in half the time of torch
-        turns, jittered = 4 * rows, (4 + 9) * rows  # where rotations and coefficients begin
+        turns = rows * _INTRINSICS  # where rotations begin
+        jittered = turns + rows * _ROTATION  # where coefficients begin
         intrinsics, rotation, k = numbers[:turns].reshape(*batch, 4), None, self._coefficients
-        if not _TURNS.isdisjoint(self._names):
+        if self._turns:
             rotation = torch.from_numpy(numbers[turns:jittered].reshape(*batch, 3, 3))
-        if jitters:
-            k = numbers[jittered : jittered + call.count * rows].reshape(*batch, call.count)
-        made = None  # the new cameras as C takes them, if it can
+        if self._sensitivity is not None:
+            k = numbers[jittered : jittered + rows * call.count].reshape(*batch, call.count)
+        native: Native | None = None
         if self._is_flat and not left:
-            if c_makes_lenses or (not jitters and native.cameras == rows):
-                # the function keeps the call, of which the struct is a part, and all that this points to
-                made = Native(native.plan, call.made, partial(self._lenses, call, room, k))
-            elif not batch:
-                made = single_native(model_of(self.base), torch.from_numpy(intrinsics), torch.from_numpy(k))
-        filling = (shares[:rows], shares[rows:]) if call.share else ()
-        return LazyWarp(base, intrinsics, k, self._size, rotation, options, self._source_native, made, *filling)
+            native = self._native(call, room, intrinsics, k)
+        return LazyWarp(like, intrinsics, k, self._size, rotation, options, self._source_native, native, zooms, filled)
 
     def _packed(self, values: Mapping[str, Any]) -> tuple[Any, tuple[int, ...]]:
         """Return drawn values kind after kind, as C takes them, and (B,); () for numbers and lists of one camera."""
-        given: Any = [*map(values.__getitem__, self._names)]
+        given: list[Any] = [values[name] for name in self._names]
         if given and isinstance(given[0], np.ndarray):
             batch = self._batch or (len(given[0]),)
-            given = np.concatenate(given, None)
-            self._check_count(len(given), batch[0])
-            return _array(c_double, len(given)).from_buffer(given), batch
+            numbers = np.concatenate(given, None)
+            self._check_count(len(numbers), batch[0])
+            return _array(c_double, len(numbers)).from_buffer(numbers), batch
         if len(given) < self._drawn:  # some values are several numbers
             flat: list[float] = []
             for value in given:
                 flat += value if isinstance(value, list) else (value,)
             given = flat
-        if len(given) != self._drawn:
-            self._check_count(len(given), 1)
+        self._check_count(len(given), 1)
         return _array(c_double, len(given))(*given), self._batch
 
     def _check_count(self, count: int, rows: int) -> None:
@@ -218,6 +225,39 @@ class Start:
             several = [f"{name} as Range(low, high, {size})" for name, (_, size) in DRAWN_KINDS.items() if size > 1]
             wanted = f"{self._drawn} numbers for a sample, {', '.join(several)}, and others as Range(low, high)"
             raise ValueError(f"{self._owner}: ranges must draw {wanted}; got {count} for {rows} samples")
+
+    def _run(self, call: structs.Draws, values: Mapping[str, Any]) -> int:
+        """Have C write the new cameras; return flags, zero unless some numbers are no camera's.
+
+        C returns flags of limits and ends that it lacked. Python computes them and calls again; those of the source and
+        the base serve all later draws.
+        """
+        jitters = self._sensitivity is not None
+        needs_candidates = jitters and not self._c_makes_lenses and call.cameras > 0
+        candidates = self._candidates(values, call) if needs_candidates else None
+        if self._needs_limits:
+            self._add_limits(call)
+        run = loaded().camtorch_draws
+        left = run(call)
+        while left & ~structs.NO_CAMERA:
+            self._complete(left, values, call, candidates)
+            left = run(call)
+        if jitters and call.followed < call.cameras:
+            call.made.limits2 = call.made.extent = None
+        return left
+
+    def _native(
+        self, call: structs.Draws, room: object, intrinsics: np.ndarray[Any, Any], k: np.ndarray[Any, Any]
+    ) -> Native | None:
+        """Return the new cameras as native code takes them; None if it lacks the lenses of several."""
+        base = self._base_native
+        has_lenses = self._c_makes_lenses if self._sensitivity is not None else base.cameras == call.cameras
+        if has_lenses:
+            # the function keeps the call, of which the struct is a part, and all that this points to
+            return Native(base.plan, call.made, partial(self._lenses, call, room, k))
+        if intrinsics.ndim == 1:
+            return single_native(model_of(self.base), torch.from_numpy(intrinsics), torch.from_numpy(k))
+        return None
 
     def _candidates(self, values: Mapping[str, Any], call: structs.Draws) -> Native:
         """Make the lenses that native code chooses among, of a model whose domain it does not make by itself."""

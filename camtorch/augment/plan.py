@@ -59,6 +59,17 @@ def form_of(
     return *state, type(camera), camera.image_size, *numbers, type(sample), *values, *fields.items()
 
 
+class CallOfFields(NamedTuple):
+    """A call of C, and the names of the fields that it moves."""
+
+    names: Sequence[str]
+    narrowed: Sequence[str]  # of those, pixels and boxes that come out in another dtype than that of the cameras
+    call: SampleCall | None  # None if no call serves
+
+
+_NO_CALL = CallOfFields([], [], None)
+
+
 @dataclass(frozen=True)
 class SamplePlan:
     """How samples of one form move. It is made once, and kept as long as the form and the transform stay the same."""
@@ -69,18 +80,23 @@ class SamplePlan:
     masks: Sequence[str]  # names of the masks of validity that come out: "image_valid" and so on
     mask_fill: float
     calls: Kept | None
-    """Maps settings to the names of the fields that one call of C moves, and the call; None if autograd may record."""
+    """Maps settings to the `CallOfFields`; None if autograd may record."""
+
+    @functools.cached_property
+    def matrices(self) -> Sequence[str]:
+        """The names of the fields that are matrices K."""
+        return [name for name, kind in self.fields.items() if kind == "K"]
 
     def rows(self, value: Any) -> Any:
         """Return a value with a dim B; a list has one already."""
         return value if self.batched or isinstance(value, list) else value.unsqueeze(0)
 
-    def together(self, change: Change, values: Mapping[str, Any]) -> dict[str, MovedField]:
+    def together(self, change: Change, values: Mapping[str, Any]) -> Mapping[str, MovedField | None]:
         """Move by one call of C: images, pixels, and of a single sample whose camera C drew also boxes and rays.
 
         A `LazyWarp` goes to such a camera; other warps move images and pixels alone. Without the library, pixels and
         boxes move by one evaluation in torch. The other fields, and all of them if no call serves, are not in the
-        result.
+        result, or None.
         """
         part, calls = change.parts[0], self.calls
         moves = part.moves
@@ -108,16 +124,20 @@ class SamplePlan:
             return {}
         # The call is kept by all that it depends on, beside the form
         settings = size, source.dtype, labels, thread_count(), *moves.options.values()
-        new = functools.partial(self._new_call, values, part.camera, size, source.dtype, moves.options, labels)
-        names, call = calls((), settings, new)
-        if call is None or (moved := call(source, target, rotation, [*map(values.__getitem__, names)])) is None:
+        known = calls.entry((), settings)
+        if known is None:
+            new = functools.partial(self._new_call, values, part.camera, size, source.dtype, moves.options, labels)
+            names, narrowed, call = calls((), settings, new)
+        else:
+            names, narrowed, call = known.result
+        moved = None if call is None else call(source, target, rotation, [values[name] for name in names])
+        if moved is None:
             return {}
-        # Pixels and boxes are computed in the dtype of the cameras, and come out in their own
-        results = dict[str, MovedField]()
-        for name, result in zip(names, moved, strict=True):
-            if result is not None:
-                rows, valid = result
-                results[name] = _in_range(rows, dtype) if (dtype := values[name].dtype) != rows.dtype else rows, valid
+        results = dict(zip(names, moved, strict=True))
+        for name in narrowed:
+            pair = results[name]
+            if pair is not None:
+                results[name] = _in_range(pair[0], values[name].dtype), pair[1]
         return results
 
     def _new_call(
@@ -128,8 +148,8 @@ class SamplePlan:
         dtype: torch.dtype,
         options: Options,
         labels: Sequence[Label],
-    ) -> tuple[Sequence[str], SampleCall | None]:
-        """Return the names of the fields that one call of C moves, and the call; None if no call serves.
+    ) -> CallOfFields:
+        """Return the call of C that moves several fields.
 
         camera, size: of the images, and of the new ones. dtype, options: as of `call_for`. labels: those that it moves
         beside pixels.
@@ -138,13 +158,14 @@ class SamplePlan:
         for name, kind in self.fields.items():
             value = values[name]
             if isinstance(value, list) or field_of(kind, value).by_c == "never":
-                return [], None
+                return _NO_CALL
             if (how := self._how_of(kind, value, dtype, options, labels)) is not None:
                 hows[name] = how
         if not hows:
-            return [], None
+            return _NO_CALL
         sizes, chosen = (camera.size_for("Warp"), size), [values[name] for name in hows]
-        return [*hows], call_for(sizes, dtype, options, chosen, [*hows.values()], self.batched)
+        narrowed = [name for name, how in hows.items() if how in ("pixels", "boxes") and values[name].dtype != dtype]
+        return CallOfFields([*hows], narrowed, call_for(sizes, dtype, options, chosen, [*hows.values()], self.batched))
 
     def _how_of(
         self, kind: str, value: Tensor, dtype: torch.dtype, options: Options, labels: Sequence[Label]

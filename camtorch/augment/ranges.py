@@ -108,7 +108,7 @@ def draw_numbers(
     gate = torch.rand(rows, generator=generator, dtype=torch.float32, device=device) < p if 0 < p < 1 else None
     # in float64, so that what is drawn is what every precision sees
     shares: Any = torch.rand(total, generator=generator, dtype=torch.float64, device=device)
-    if not is_eager(shares):
+    if not (shares.is_cpu and is_eager()):
         values: dict[str, Any] = {"apply": torch.full((rows,), p >= 1, device=device) if gate is None else gate}
     elif rows == count == 1:
         values, share = {"apply": [p >= 1] if gate is None else gate.tolist()}, iter(shares.tolist())

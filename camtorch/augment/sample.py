@@ -235,7 +235,7 @@ class SampleTransform(KeepsCamera, nn.Module):
             are_as_given = all(value is sample[name] for name, value in batch.values.items())
             if form is not None and are_as_given and batch.camera.intrinsics.device == camera.intrinsics.device:
                 self._calls.plans((), form, lambda: batch.plan)
-        if "K" in batch.plan.fields.values():
+        if batch.plan.matrices:
             self._check_matrices(batch, sample)
         return batch
 
@@ -268,7 +268,7 @@ class SampleTransform(KeepsCamera, nn.Module):
 
     def _check_matrices(self, batch: Batch, sample: Sample) -> None:
         """Raise a ValueError if fields K are not the camera of a batch, or cannot be the new one's."""
-        matrices = [name for name, kind in batch.plan.fields.items() if kind == "K"]
+        matrices = batch.plan.matrices
         if not isinstance(sample.get("camera"), (Guess, type(None))):
             of = "the camera of the sample"
         elif isinstance(self.camera, Camera):
@@ -313,15 +313,17 @@ class SampleTransform(KeepsCamera, nn.Module):
     def _moved(self, sample: Sample, batch: Batch, change: Change) -> Sample:
         """Return the sample with all that moves by a change, what is valid of it, the rotation and the camera."""
         plan, batched, mirroring = batch.plan, batch.plan.batched, self.mirroring
-        if "K" in plan.fields.values():
+        if plan.matrices:
             check_targets(plan.fields, change, self._name)
         moved = dict(sample)
-        options = {"mask_fill": self.mask_fill, "lateral": mirroring.lateral if mirroring else 0}
         # `image_valid` asks for the position of each pixel, which the call of C would compute once more
         together = {} if "image_valid" in plan.masks else plan.together(change, batch.values)
         for name in plan.fields:
-            value, valid = together[name] if name in together else batch.moved(name, change, options, self._name)
-            moved[name] = value
+            pair = together.get(name)
+            if pair is None:
+                options = {"mask_fill": self.mask_fill, "lateral": mirroring.lateral if mirroring else 0}
+                pair = batch.moved(name, change, options, self._name)
+            moved[name], valid = pair
             if valid is not None:
                 key = f"{name}_valid"
                 given = sample.get(key)
