@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import Unpack
@@ -16,23 +14,20 @@ from typing_extensions import Unpack
 from camtorch.augment.cameras import known_camera
 from camtorch.augment.change import Change, Part, by_models, check_sizes, one_or_batch
 from camtorch.augment.devices import Elsewhere, twin_of
+from camtorch.augment.draws import checked_draw, chosen_boxes
+from camtorch.augment.empty_images import warn_if_empty, warn_of_unfilled
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
-from camtorch.augment.filling import enough, filled, scaled
+from camtorch.augment.filling import enough, scaled
 from camtorch.augment.matrices import Guess
-from camtorch.augment.ranges import Draw, Range, draw_numbers, rows_of
+from camtorch.augment.ranges import Draw, Range, as_tensors, draw_numbers, rows_of, values_for, which_apply
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
-from camtorch.evaluate.door import has_tangent, is_cheap_to_read, keeps_graph
-from camtorch.evaluate.tensors import are_concrete, are_numbers, known_false, known_true
-from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_mapping, as_part, as_whole, hinting, shown, warn
+from camtorch.evaluate.tensors import are_concrete, known_false
+from camtorch.values.arguments import GUESS_CAMERA, as_flag, as_part, as_whole, hinting
 from camtorch.values.module import typed_as
 from camtorch.warp.views import place_of
 from camtorch.warp.warp import Warp
-
-_LEAST_SHOWN = 2 / 3  # of what an image shows of its own camera: with less than that, on average, it warns
-_TRIES = 8
-_first = operator.itemgetter(0)
 
 
 class FlipOptions(SampleOptions, total=False):
@@ -155,15 +150,23 @@ class Augmentation(SampleTransform):
             for name, value in numbers.items()
         }
 
-    # Kinds of camtorch override these, besides `new_camera`, in the order in which a call asks them:
-    # _draw_numbers   Compose, of all parts
-    # _with_labels    RandomMount, for the depths of a shift; boxes of `crops` for all
-    # _checked_draw   RandomMount, of a draw that was given
-    # _change         Compose, step by step; Edit, by a matrix
-    # _part           lenses and mounts, by C; RandomMount with a shift; RandomShutter
-    # _new_camera     lenses and mounts, whose formulas take float64
-    # _part_between   lenses and mounts, with colours and light
-    # and, without a draw: size_after, tell_of_empty_images, _tell_of, _chain_error, _warp_options
+    # What kinds of camtorch state otherwise, or override, besides `new_camera`; methods in the order of a call:
+    #
+    # crops, place             BoxCrop; Compose, of all in it
+    # drawn_on_host            edits, lenses and mounts; Compose, if all in it are
+    # beside_the_camera        lenses and mounts: colours and light
+    # keeps_lens               RandomShutter
+    # _draw_numbers            Compose, of all in it
+    # _with_labels             RandomMount, for the depths of a shift; here boxes, for `crops`
+    # _checked_draw            RandomMount, of a draw that was given
+    # _change                  Compose, step by step; Edit, by a matrix
+    # _part                    lenses and mounts, by C; RandomMount with a shift; RandomShutter
+    # _new_camera              lenses and mounts, whose formulas take float64
+    # _part_between            lenses and mounts, with colours and light
+    # _tell_of                 lenses and mounts, of a field of view that was asked for
+    # tell_of_empty_images     Compose, of all in it
+    # size_after               edits; Compose, of all in it
+    # _chain_error             RandomMount with a shift; RandomShutter; Compose
 
     def _draw_numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> Draw:
         """Return a draw as lists, arrays or tensors; see `ranges.py`."""
@@ -176,20 +179,8 @@ class Augmentation(SampleTransform):
             draw: A draw; boxes that it already holds are kept.
             boxes: Boxes of the samples, (B, M, 4), or (M, 4) for each; None if samples have none.
         """
-        if not (missing := {name: index for name, index in self.crops.items() if name not in draw}):
-            return draw
-        if boxes is None:
-            raise ValueError(
-                f"{self._name}: the sample must have boxes, (B, M, 4) pixels x1, y1, x2, y2, to crop one of; got none"
-            )
-        for i, rows in enumerate(boxes):
-            for index in missing.values():
-                if not -len(rows) <= index < len(rows):
-                    raise ValueError(
-                        f"{self._name}: sample {i} must have a box of index {index}; got {len(rows)} boxes"
-                    )
-        chosen = {name: [rows[index] for rows in boxes] for name, index in missing.items()}
-        return {**draw, **{n: torch.stack(rows) if rows else torch.empty(0, 4) for n, rows in chosen.items()}}
+        missing = {name: index for name, index in self.crops.items() if name not in draw}
+        return {**draw, **chosen_boxes(missing, boxes, self._name)} if missing else draw
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return the (height, width) of new images, of images of a size."""
@@ -216,14 +207,6 @@ class Augmentation(SampleTransform):
             return camera
         return twin_of(camera) or camera
 
-    def _state_key(self) -> tuple[Any, ...]:
-        """Return what, but for tensors, changes follow from: another key if anything of it or of its parts was set."""
-        if torch.compiler.is_compiling():  # nothing is kept then, and compilers know no `str` of a list
-            return ()
-        states = [vars(part) for part in self.modules()]
-        revisions = [getattr(state.get("_calls"), "revision", None) for state in states]  # with public attributes
-        return *revisions, str([[state.get(name) for name in ("options", "ranges", "image_size")] for state in states])
-
     def _change(self, camera: Camera, draw: Draw) -> Change:
         """Return the change of a draw of any form."""
         if 0 < self.p < 1 and self.image_size not in (None, camera.image_size):
@@ -232,7 +215,7 @@ class Augmentation(SampleTransform):
                 f"got image_size={self.image_size} for images of {camera.image_size}"
             )
         applied, count = draw["apply"], len(draw["apply"])
-        chosen = _chosen(applied)
+        chosen = which_apply(applied)
         if chosen is not None and not all(chosen):
             return self._change_of_some(camera, draw, chosen)
         # if values may not be read, all rows are moved, and `gate` later keeps those that were not drawn
@@ -263,31 +246,13 @@ class Augmentation(SampleTransform):
         return None
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Draw:
-        """Check a draw that is given, and return it as arrays, or as tensors if numbers may not be read."""
-        as_mapping(draw, "draw", self._name, "what draw() returns")
-        sizes = {**{name: interval.size for name, interval in self.ranges.items()}, **dict.fromkeys(self.crops, 4)}
-        if missing := [name for name in ("apply", *sizes) if name not in draw]:
-            has = ", ".join(map(str, draw)) or "nothing"
-            raise ValueError(f"{self._name}: draw must have {', '.join(missing)}; got {has}")
-        values: dict[str, Any] = {name: torch.as_tensor(draw[name]) for name in ("apply", *sizes)}
-        if values["apply"].ndim != 1:
-            raise ValueError(
-                f"{self._name}: draw['apply'] must be (B,), which of B samples move; got {shown(draw['apply'])}"
-            )
-        values["apply"] = values["apply"] > 0.5
-        if are_numbers(*values.values()):
-            values = {n: (value if n == "apply" else value.double()).numpy() for n, value in values.items()}
-        for name, size in sizes.items():
-            value, count = values[name], len(values["apply"])
-            shape = (count,) if size is None else (count, size)
-            if tuple(value.shape) != shape:
-                raise ValueError(f"{self._name}: draw[{name!r}] must be {shape}; got shape {tuple(value.shape)}")
-            if isinstance(value, np.ndarray) and not np.isfinite(value).all():
-                raise ValueError(f"{self._name}: draw[{name!r}] must be finite; got {value.tolist()}")
-        return values
+        """Return a draw that was given as arrays, or as tensors if numbers may not be read."""
+        sizes: dict[str, int | None] = {name: interval.size for name, interval in self.ranges.items()}
+        sizes |= dict.fromkeys(self.crops, 4)
+        return checked_draw(draw, sizes, self._name)
 
     def _part(self, source: Camera, draw: Draw) -> Part:
-        return self._part_by_torch(source, self._values_for(source, draw))
+        return self._part_by_torch(source, values_for(source, draw))
 
     def _part_by_torch(self, source: Camera, values: Mapping[str, Any]) -> Part:
         target, rotation = self._new_camera(source, values)
@@ -301,41 +266,17 @@ class Augmentation(SampleTransform):
         """Return the part from a source to a target; `values` may change images in more ways, such as their light."""
         return Part(source, Warp(source, target, rotation, **self._warp_options))
 
-    def _values_for(self, source: Camera, draw: Draw) -> dict[str, Any]:
-        """Return drawn values, (*B,) or (*B, size).
-
-        If one camera serves all samples and all draws are equal, the dim *B is left out: one warp serves all.
-        """
-        if isinstance(draw["apply"], list):  # of one sample
-            values = dict(zip(draw, map(_first, draw.values()), strict=True))  # without a loop of Python
-            del values["apply"]
-            return values
-        values = {name: value for name, value in draw.items() if name != "apply"}
-        if source.batch_shape or (len(draw["apply"]) != 1 and not all(map(_are_alike, values.values()))):
-            return values
-        return {n: value[0].tolist() if isinstance(value, np.ndarray) else value[0] for n, value in values.items()}
-
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         """Call `new_camera` with values as drawn."""
-        return self.new_camera(source, self._as_tensors(source, values))
-
-    @staticmethod
-    def _as_tensors(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Return the values as tensors in the source's dtype and on its device."""
-        dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
-        return {n: torch.as_tensor(value, dtype=dtype, device=source.intrinsics.device) for n, value in values.items()}
+        return self.new_camera(source, as_tensors(source, values))
 
     def _tell_of(self, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor) -> None:
         """Warn, once, if filled parts (*B,) are less than `min_filled` with these factors (*B,) on focal lengths."""
         share = self.min_filled or 0.0
         if self._calls.has_looked or not known_false(found >= share):
             return
-        self._calls.has_looked, few = True, int((found < share).sum())
-        warn(
-            f"{self._name}: min_filled must be within reach; got {share:g}, and of {few} of {found.numel()} new images "
-            f"down to {float(found.min()):.0%} shows something: the camera of the images does not see along the axis "
-            "of the new one. Turn it less, or use less of min_filled"
-        )
+        self._calls.has_looked = True
+        warn_of_unfilled(self._name, share, found)
 
     def tell_of_empty_images(self, camera: Camera) -> None:
         """Warn, once, if new images of `camera` will be mostly empty; draws from a generator of its own show it."""
@@ -346,19 +287,7 @@ class Augmentation(SampleTransform):
         if not are_concrete(camera.intrinsics):
             return
         self._calls.has_looked = True
-        values = draw_numbers(self.ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
-        with torch.no_grad():
-            first = camera.detach()
-            first = first[[0] * _TRIES] if first.batch_shape else first
-            shares = filled(first, *self._new_camera(first, self._values_for(first, values)))
-            most = filled(first, first, None)  # less than 1 if a fisheye shows a circle
-        if shares.mean() < _LEAST_SHOWN * most.mean():
-            warn(
-                f"{self._name}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
-                f"{1 - float(shares.min()):.0%}, as the camera of the images does not see so far. min_filled=0.9 zooms "
-                "until that much of every image shows something; fov='source', in lenses, takes one as wide as the "
-                "images are; min_filled=0 says that it is meant so"
-            )
+        warn_if_empty(self._name, camera, self.ranges, self._new_camera)
 
     @on_samples
     @hinting(f"Name the fields, as in image=image. {FRONT_ENDS}")
@@ -471,12 +400,12 @@ class Augmentation(SampleTransform):
         """Add to a draw the boxes that it needs of a sample: those named `boxes`, or the first of that kind."""
         if not self.crops:
             return draw
-        found: dict[str, Any] = {name: pair for name, pair in rows().items() if pair[0] in BOXES}
+        found = {name: pair for name, pair in rows().items() if pair[0] in BOXES}
         kind, boxes = found.get("boxes", next(iter(found.values()), ("boxes", None)))
-        if kind != "boxes":
-            boxes = [as_corners(kind, b) for b in boxes] if isinstance(boxes, list) else as_corners(kind, boxes)
-        if getattr(boxes, "ndim", 0) > 3:  # of the frames of one sample: those of the first frame decide
+        if isinstance(boxes, Tensor) and boxes.ndim > 3:  # of the frames of one sample: those of the first frame decide
             boxes = boxes.flatten(0, -3)[:1]
+        if boxes is not None:
+            boxes = [as_corners(kind, of_sample) for of_sample in boxes]
         return self.with_boxes(draw, boxes)
 
     if TYPE_CHECKING:
@@ -489,21 +418,6 @@ class Augmentation(SampleTransform):
         parts += [f"{name}={interval}" for name, interval in self.ranges.items()]
         said = {"p": self.p, "same_on_batch": self.same_on_batch, **self._warp_options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in said.items()])
-
-
-def _chosen(applied: Any) -> list[bool] | None:
-    """Return which samples a draw moves, (B,); None if values may not be read."""
-    if isinstance(applied, Tensor) and len(applied) and not is_cheap_to_read(applied):
-        return None
-    return applied if isinstance(applied, list) else applied.tolist()
-
-
-def _are_alike(value: Any) -> bool:
-    """Whether all rows of an array or a tensor are known to be the same, and none has a derivative of its own."""
-    if isinstance(value, Tensor) and (keeps_graph(value) or has_tangent(value)):
-        return False
-    same = value == value[:1]
-    return same.size > 0 and bool(same.all()) if isinstance(same, np.ndarray) else known_true(same)
 
 
 def put_place(sample: Mapping[str, Any], moved: dict[str, Any], owner: str) -> None:

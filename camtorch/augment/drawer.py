@@ -18,7 +18,7 @@ from camtorch.augment.filling import enough, scaled, tell_of_narrow_images
 from camtorch.augment.jitter import jittered
 from camtorch.augment.native_draws import DRAWN_KINDS, Start, Wanted, too_wide
 from camtorch.augment.presets import REAL, as_like
-from camtorch.augment.ranges import Draw, Range, RangeLike, as_range
+from camtorch.augment.ranges import Draw, Range, RangeLike, as_range, as_tensors, values_for
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import hold_numbers, known_false, with_derivatives_of
@@ -157,7 +157,7 @@ class CameraDrawer(Augmentation):
     drawn_on_host = _keeps_formulas  # the formulas take numbers alone
 
     def _part(self, source: Camera, draw: Draw) -> Part:
-        values = self._values_for(source, draw)
+        values = values_for(source, draw)
         # a draw is of tensors where something is recorded
         start = None if isinstance(draw["apply"], Tensor) else self._start(source, values)
         if start is None:
@@ -300,7 +300,7 @@ class CameraDrawer(Augmentation):
 
     def _part_between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
         """Return the part with the effect of the lens on colours and light."""
-        beside = self._as_tensors(source, {name: values[name] for name in self.beside_the_camera.intersection(values)})
+        beside = as_tensors(source, {name: values[name] for name in self.beside_the_camera.intersection(values)})
         cameras, light = [target], None
         if "chromatic" in beside:  # red and blue are seen by cameras of their own
             cameras += [scaled(target, 1 + beside["chromatic"][..., i]) for i in (0, 1)]

@@ -14,6 +14,7 @@ of these forms:
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -21,8 +22,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from camtorch.evaluate.door import is_eager
+from camtorch.cameras.camera import Camera
+from camtorch.evaluate.door import has_tangent, is_cheap_to_read, is_eager, keeps_graph
+from camtorch.evaluate.tensors import known_true
 from camtorch.values.arguments import as_number, shown, warn
 
 RangeLike = float | Sequence[float]
@@ -30,6 +34,7 @@ Draw = Mapping[str, Any]
 """A draw in any of its forms."""
 
 Spans = SimpleNamespace  # by that name pickles of 0.4.0 have one that nothing reads
+_first = operator.itemgetter(0)
 _RADIANS = 0.8  # 45 degrees: a range of degrees within it is more likely in radians
 
 
@@ -133,3 +138,39 @@ def draw_numbers(
 def rows_of(draw: Draw, rows: list[int] | None) -> Draw:
     """Return these rows of a draw of arrays or tensors; None: all."""
     return {name: value if rows is None else value[rows] for name, value in draw.items()}
+
+
+def which_apply(applied: Any) -> list[bool] | None:
+    """Return which samples a draw moves, (B,), by its `apply`; None if values may not be read."""
+    if isinstance(applied, Tensor) and len(applied) and not is_cheap_to_read(applied):
+        return None
+    return applied if isinstance(applied, list) else applied.tolist()
+
+
+def values_for(source: Camera, draw: Draw) -> dict[str, Any]:
+    """Return drawn values, (*B,) or (*B, size).
+
+    If one camera serves all samples and all draws are equal, the dim *B is left out: one warp serves all.
+    """
+    if isinstance(draw["apply"], list):  # of one sample
+        values = dict(zip(draw, map(_first, draw.values()), strict=True))  # without a loop of Python
+        del values["apply"]
+        return values
+    values = {name: value for name, value in draw.items() if name != "apply"}
+    if source.batch_shape or (len(draw["apply"]) != 1 and not all(map(_are_alike, values.values()))):
+        return values
+    return {n: value[0].tolist() if isinstance(value, np.ndarray) else value[0] for n, value in values.items()}
+
+
+def _are_alike(value: Any) -> bool:
+    """Whether all rows of an array or a tensor are known to be the same, and none has a derivative of its own."""
+    if isinstance(value, Tensor) and (keeps_graph(value) or has_tangent(value)):
+        return False
+    same = value == value[:1]
+    return same.size > 0 and bool(same.all()) if isinstance(same, np.ndarray) else known_true(same)
+
+
+def as_tensors(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return values as tensors in the source's dtype and on its device."""
+    dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
+    return {n: torch.as_tensor(value, dtype=dtype, device=source.intrinsics.device) for n, value in values.items()}

@@ -10,7 +10,7 @@ from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.change import Part
-from camtorch.augment.ranges import Draw, RangeLike, as_range
+from camtorch.augment.ranges import Draw, RangeLike, as_range, as_tensors, values_for
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import one_of
 from camtorch.warp.shutter import DIRECTIONS, Direction, RollingShutter, ShutterWarp
@@ -53,6 +53,6 @@ class RandomShutter(Augmentation):
         return f"move no rows of a rolling shutter: {name} goes last" if later else None
 
     def _part(self, source: Camera, draw: Draw) -> Part:
-        values = self._as_tensors(source, self._values_for(source, draw))
+        values = as_tensors(source, values_for(source, draw))
         shutter = RollingShutter(values["readout"], torch.deg2rad(values["rates"]), direction=self.direction)
         return Part(source, ShutterWarp(source, source, target_shutter=shutter, **self._warp_options))

@@ -312,9 +312,9 @@ WARNINGS = {
     "fov": ("tell_of_narrow_images", lambda: A.RandomLens("kannala_brandt", fov=(120, 140), min_filled=0.9), {}),
     "fov of a preset": ("tell_of_narrow_images", lambda: A.RandomCamera("dms130", fov=(120, 140), min_filled=0.9), {}),
     "fov of real lenses": ("tell_of_narrow_images", lambda: A.RandomLens("real", fov=(120, 140), min_filled=0.9), {}),
-    "min_filled": ("_tell_of", lambda: A.RandomCamera("dms130", yaw=1, pitch=1, roll=1, min_filled=0.9), {}),
-    "empty": ("tell_of_empty_images", lambda: A.RandomCamera("dms130"), {}),
-    "empty, in a chain": ("tell_of_empty_images", lambda: A.Compose([A.VerticalFlip(), A.RandomCamera("dms130")]), {}),
+    "min_filled": ("warn_of_unfilled", lambda: A.RandomCamera("dms130", yaw=1, pitch=1, roll=1, min_filled=0.9), {}),
+    "empty": ("warn_if_empty", lambda: A.RandomCamera("dms130"), {}),
+    "empty, in a chain": ("warn_if_empty", lambda: A.Compose([A.VerticalFlip(), A.RandomCamera("dms130")]), {}),
     "fov, in a chain": (
         "tell_of_narrow_images",
         lambda: A.Compose([A.HorizontalFlip(), A.RandomLens("kannala_brandt", fov=(120, 140), min_filled=0.9)]),

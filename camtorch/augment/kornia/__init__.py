@@ -163,7 +163,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
         camera = camera_with_params(params, camera, device)
         inputs = [*values.values(), camera.intrinsics, camera.distortion]
         inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
-        key = type(camera), camera.image_size, self.augmentation._state_key()
+        key = type(camera), camera.image_size, _state_key(self.augmentation)
         of_row, of_batch = self._memos
         memo = of_row if len(values["apply"]) == 1 else of_batch
         return memo.unless_learning(inputs, key, lambda: self.augmentation.change(camera, values))
@@ -253,6 +253,15 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     def __repr__(self) -> str:
         ranges = "".join(f"{name}={interval}, " for name, interval in self.augmentation.ranges.items())
         return super().__repr__().replace("(", f"({ranges}", 1)
+
+
+def _state_key(augmentation: Augmentation) -> tuple[Any, ...]:
+    """Return what, but for tensors, changes follow from: another key if anything of it or of its parts was set."""
+    if torch.compiler.is_compiling():  # nothing is kept then, and compilers know no `str` of a list
+        return ()
+    states = [vars(part) for part in augmentation.modules()]
+    revisions = [getattr(state.get("_calls"), "revision", None) for state in states]  # with public attributes
+    return *revisions, str([[state.get(name) for name in ("options", "ranges", "image_size")] for state in states])
 
 
 def _homographies(part: Part, rows: Tensor) -> Tensor:
