@@ -165,7 +165,7 @@ class Augmentation(SampleTransform):
     # _part_between            lenses and mounts, with colours and light
     # _tell_of                 lenses and mounts, of a field of view that was asked for
     # tell_of_empty_images     Compose, of all in it
-    # size_after               edits; Compose, of all in it
+    # _size_if_applied         edits; Compose, of all in it
     # _chain_error             RandomMount with a shift; RandomShutter; Compose
 
     def _draw_numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> Draw:
@@ -184,6 +184,9 @@ class Augmentation(SampleTransform):
 
     def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return the (height, width) of new images, of images of a size."""
+        return self._size_if_applied(size) if self.p else size
+
+    def _size_if_applied(self, size: tuple[int, int]) -> tuple[int, int]:
         return self.image_size or size
 
     def change(self, camera: Camera | Sequence[Camera] | None, draw: Mapping[str, Tensor]) -> Change:
@@ -369,11 +372,14 @@ class Augmentation(SampleTransform):
     ) -> Sample:
         """Move a sample back: by the last call's change, or by that of a `draw` and the `camera` before it.
 
-        Pixels that left the image stay lost; enclosing boxes have grown; chromatic aberration and vignetting stay.
+        Without a draw, `camera` is a field of the sample, the camera that the change made. Pixels that left the image
+        stay lost; enclosing boxes have grown; chromatic aberration and vignetting stay.
 
         Raises:
             ValueError: nothing was called, or the sample's camera is not the one that the change made.
         """
+        if draw is None and camera is not None:  # a field of the sample, as in `inverse(**result)`
+            fields["camera"], camera = camera, None
         sample = self._given(sample, fields)
         if clips := self._clips(sample):
             if draw is not None:

@@ -150,7 +150,7 @@ class Compose(Augmentation):
             values |= {f"{i}.{name}": value for name, value in drawn.items()}
         return {name: value if isinstance(value, Tensor) else np.asarray(value) for name, value in values.items()}
 
-    def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
+    def _size_if_applied(self, size: tuple[int, int]) -> tuple[int, int]:
         for part in self.parts:
             size = part.size_after(size)
         return size

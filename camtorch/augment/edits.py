@@ -66,7 +66,7 @@ class Edit(Augmentation):
             plain numbers, which torch.compile can read; and (height, width).
         """
 
-    def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
+    def _size_if_applied(self, size: tuple[int, int]) -> tuple[int, int]:
         nothing = {n: torch.full(() if r.size is None else (r.size,), r.low).double() for n, r in self.ranges.items()}
         return self.edit(size, nothing)[1]
 
@@ -305,7 +305,7 @@ class Rotate90(Edit):
         self.times = ends[0], ends[1], as_whole(step, "step", name, least=1)
         super().__init__({"times": Range(0, 1)}, **options)
 
-    def size_after(self, size: tuple[int, int]) -> tuple[int, int]:
+    def _size_if_applied(self, size: tuple[int, int]) -> tuple[int, int]:
         return size[::-1] if self.times[0] % 2 else size
 
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:

@@ -49,7 +49,8 @@ class FaceNormalizer(SampleTransform):
 
     A sample has the fields of an `Augmentation`, among them `head_pose` (B, 4, 4), or `rvec` and `tvec`, camera from
     head, with the head's x axis from its right eye to its left, along the image's x axis if the face looks into the
-    camera. The face's centre is `face_center` (B, 3) if the sample has it, else the origin of the head. The result also
+    camera; a pose by another name has its kind in `fields`. The face's centre is `face_center` (B, 3) if the sample
+    has it, else the origin of the head. The result also
     holds `scale` (B,), distance / |c|, `camera` and `rotation`.
 
         >>> normalize = ct.augment.FaceNormalizer(camera=ct.Pinhole([900.0, 900, 319.5, 239.5], image_size=(480, 640)))
@@ -137,16 +138,14 @@ class FaceNormalizer(SampleTransform):
         camera = batch.camera
         if not isinstance(sample.get("camera", camera), (Camera, Guess)):
             raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(sample['camera'])}")
-        values = {name: value for name, (_, value) in batch.rows().items()}
-        if listed := [n for n in ("head_pose", "rvec", "tvec", "face_center") if isinstance(values.get(n), list)]:
-            raise TypeError(f"{self._name}: {', '.join(listed)} must be one tensor for all samples; got a list")
-        if "head_pose" in values:
-            head, centre = values["head_pose"][..., :3, :3], values["head_pose"][..., :3, 3]
-        elif "rvec" in values and ("tvec" in values or "face_center" in values):
-            head, centre = rotation_matrix(values["rvec"]), values.get("tvec")
-        else:
+        named = batch.rows()
+        values = {name: value for name, (_, value) in named.items()}
+        found = self._head(values)
+        if found is None:  # by another name: the first field of each kind
+            found = self._head({**dict(reversed(named.values())), **values})
+        if found is None:
             raise ValueError(f"{self._name}: a sample must have head_pose, or rvec and tvec; got {', '.join(sample)}")
-        centre = values.get("face_center", centre)
+        head, centre = found
         moved = self._moved(sample, batch, self.change(camera, head, centre))
         moved.pop(PLACE, None)
         scale = self.distance / centre.norm(dim=-1)
@@ -155,6 +154,17 @@ class FaceNormalizer(SampleTransform):
         if "rotation" in sample:  # by earlier augmentations
             moved["source_rotation"] = sample["rotation"].clone()
         return moved
+
+    def _head(self, values: Mapping[str, Any]) -> tuple[Tensor, Tensor] | None:
+        """Return the head's rotation (B, 3, 3) and the face's centre (B, 3) of values by name; None without a pose."""
+        if listed := [n for n in ("head_pose", "rvec", "tvec", "face_center") if isinstance(values.get(n), list)]:
+            raise TypeError(f"{self._name}: {', '.join(listed)} must be one tensor for all samples; got a list")
+        if "head_pose" in values:
+            pose = values["head_pose"]
+            return pose[..., :3, :3], values.get("face_center", pose[..., :3, 3])
+        if "rvec" in values and ("tvec" in values or "face_center" in values):
+            return rotation_matrix(values["rvec"]), values.get("face_center", values.get("tvec"))
+        return None
 
     @on_samples
     def inverse(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:

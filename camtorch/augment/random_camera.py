@@ -149,8 +149,10 @@ class RandomMount(CameraDrawer):
         named = rows()
         for key, (field, _) in _DEPTHS.items():
             for found, value in named.values():
-                if found == field and isinstance(value, Tensor):
+                if found == field:
                     others = {name: v for name, v in draw.items() if name not in _DEPTHS}
+                    if isinstance(value, list):  # a plane for each sample, with a channel or without
+                        value = torch.stack([plane.reshape(-1, *plane.shape[-2:]) for plane in value])
                     return {**others, key: value if value.ndim == 4 else value[:, None]}
         raise ValueError(
             f"{self._name}: with shift the sample must have depth (B, 1, H, W) or distance, as near things shift "

@@ -144,3 +144,11 @@ def test_trainers_move_boxes_by_the_name_of_a_class():
         middle, sides = (moved[:2] + moved[2:]) / 2, moved[2:] - moved[:2]
         np.testing.assert_allclose(out["bboxes"][0], np.concatenate((middle, sides)) / ([width, height] * 2), atol=1e-3)
         assert np.abs(out["bboxes"][0] - box[0]).max() > 0.01
+
+
+def test_images_of_a_list_tell_their_size():
+    images = np.stack([sample()["image"]] * 2)
+    flip = ct.augment.albumentations.Transform(ct.augment.HorizontalFlip(p=1))
+    np.testing.assert_array_equal(flip(images=images)["images"], images[:, :, ::-1])
+    guessed = ct.augment.albumentations.Transform(ct.augment.RandomMount(camera=60), p=1)
+    assert guessed(images=images)["camera"].image_size == SIZE

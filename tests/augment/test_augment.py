@@ -408,3 +408,12 @@ def test_a_part_of_a_chain_may_be_the_same_on_a_batch():
     draw = chain.draw(4)
     assert len(set(draw["0.yaw"].tolist())) == 1
     assert len(set(draw["1.focal"].tolist())) == 4
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 3), (2, 4, 3)])
+def test_inverse_takes_the_new_camera_as_a_keyword(shape):
+    camera, augment = ct.Pinhole.from_fov(70, image_size=(24, 32)), A.RandomMount(zoom=(2, 3))
+    out = augment(image=torch.rand(*shape, 24, 32), camera=camera)
+    assert torch.equal(augment.inverse(out)["image"], augment.inverse(**out)["image"])
+    with pytest.raises(ValueError, match="must be those that this change made"):
+        augment.inverse(image=out["image"], camera=camera)

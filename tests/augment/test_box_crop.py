@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cameras import every_model, fisheye, one
-from kornia.augmentation import AugmentationSequential, VideoSequential
+from kornia.augmentation import AugmentationSequential, RandomHorizontalFlip, VideoSequential
 
 import camtorch as ct
 import camtorch.augment.albumentations
@@ -303,3 +303,28 @@ def test_a_mount_after_a_crop_shows_what_the_first_camera_sees(recwarn):
     assert not recwarn
     with pytest.warns(UserWarning, match="RandomMount: of the new images .* will show nothing"):
         mount()(crop(sample))
+
+
+@pytest.mark.parametrize("more", [{}, {"gaze": torch.rand(2, 3)}])
+def test_the_place_comes_out_of_kornia(more):
+    kornia, camera, images = ct.augment.kornia, wide().requires_grad_(False), torch.rand(2, 3, 480, 640)
+    boxes = sample_of(camera)["boxes"][:2, 0].float()
+    want = ct.augment.BoxCrop(SIZE, place=True)(image=images, boxes=boxes[:, None], camera=camera)
+    crop, mount = kornia.BoxCrop(camera, SIZE, place=True), kornia.RandomMount(want["camera"][0], roll=(20, 20))
+    for container in (
+        AugmentationSequential(crop, data_keys=None),
+        AugmentationSequential(crop, mount, data_keys=None),
+    ):
+        params = kornia.with_boxes(container.forward_parameters(images.shape), boxes)
+        out = container({"image": images, **more}, params=params)
+        assert out.keys() == {"image", "camera", "rotation", "crop_place", *more}
+        torch.testing.assert_close(out["crop_place"], place_of(out["camera"], out["rotation"]))
+        if len(container) == 1:
+            assert torch.equal(out["crop_place"], want["crop_place"])
+            assert "crop_place" not in container.inverse(out, params=params)
+    alone = AugmentationSequential(crop, data_keys=None, keepdim=True)
+    params = kornia.with_boxes(alone.forward_parameters(images[:1].shape), boxes[:1])
+    assert alone({"image": images[0]}, params=params)["crop_place"].shape == (5,)
+    flip = AugmentationSequential(crop, RandomHorizontalFlip(), data_keys=None)
+    with pytest.raises(ValueError, match="must move crop_place too"):
+        flip({"image": images}, params=params)

@@ -9,6 +9,7 @@ from cameras import spread
 
 import camtorch as ct
 from camtorch.augment import FaceNormalizer
+from camtorch.poses.rotations import rotation_vector
 
 SIZE = (240, 320)
 
@@ -171,3 +172,16 @@ def test_insightface_by_the_landmarks_that_ibug_has():
     order += [89, 95, 96, 93, 91, 90, 52, 64, 63, 71, 67, 68, 61, 58, 59, 53, 56, 55, 65, 66, 62, 70, 69, 57, 60, 54]
     assert torch.equal(ct.augment.face_points("insightface106")[order], ct.augment.face_points()[17:])
     assert [ct.augment.LANDMARKS["insightface106"][i] for i in (0, 1, 9, 16, 2, 44, 33)] == [0, 17, 25, 32, 18, 100, 87]
+
+
+def test_a_pose_has_any_name_that_fields_give(pinhole):
+    given, options = batch(), {"camera": pinhole, "focal": 600.0, "distance": 0.6}
+    want = FaceNormalizer(**options)(given)
+    out = FaceNormalizer(**options, fields={"head": "head_pose"})(head=given["head_pose"], gaze=given["gaze"])
+    for name, other in (("head", "head_pose"), ("gaze", "gaze"), ("scale", "scale"), ("rotation", "rotation")):
+        assert torch.equal(out[name], want[other])
+    vectors = {"turn": rotation_vector(given["head_pose"][:, :3, :3]), "at": given["head_pose"][:, :3, 3]}
+    out = FaceNormalizer(**options, fields={"turn": "rvec", "at": "tvec"})(vectors)
+    torch.testing.assert_close(out["rotation"], want["rotation"])
+    beside = {"head_pose": given["head_pose"], "head_pose_before": given["head_pose"].flip(0)}
+    assert torch.equal(FaceNormalizer(**options)(beside)["rotation"], want["rotation"])

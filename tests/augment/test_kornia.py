@@ -452,6 +452,22 @@ def test_the_size_of_new_images_follows_another_camera():
         assert aug._params["output_size"].tolist() == [list(out.shape[-2:])] * 2
 
 
+def test_a_number_gives_way_to_the_camera_of_the_augmentation():
+    made = augment.RandomMount(camera=camera())
+    assert torch.equal(adapter.CameraAugmentation(made, 60).camera.intrinsics, made.camera.intrinsics)
+
+
+def test_what_never_applies_leaves_the_size():
+    never, first = augment.Resize(40, p=0), augment.RandomMount(p=0, image_size=(20, 30))
+    assert never.size_after(SIZE) == first.size_after(SIZE) == augment.Compose([first, never]).size_after(SIZE) == SIZE
+    for aug in (adapter.CameraAugmentation(never, camera()), adapter.Compose(camera(), [first, never])):
+        assert aug(images()).shape[-2:] == SIZE
+        assert "output_size" not in aug._params
+    always = adapter.CameraAugmentation(never, camera(), p=1)
+    out = always(images())
+    assert tuple(always._params["output_size"][0]) == out.shape[-2:] == (40, 53)
+
+
 def test_labels_follow_a_lens_in_the_container_in_which_theirs_stay_behind():
     """kornia#4420: its fisheye and its elastic map move images, and no keypoints and boxes."""
     spot = torch.zeros(1, 1, *SIZE)

@@ -166,3 +166,17 @@ def test_labels_in_half_precision_have_the_depth_of_their_place(dtype):
     narrow, wide = (mount(sample_of(lens()), keypoints=points, draw=draw) for points in (pixels, pixels.double()))
     torch.testing.assert_close(narrow["keypoints"], wide["keypoints"].to(dtype))
     assert torch.equal(narrow["keypoints_valid"], wide["keypoints_valid"])
+
+
+@pytest.mark.parametrize("plane", [(slice(None),), (0,)])  # with a channel and without
+def test_depths_in_a_list_move_as_those_of_single_samples(plane):
+    sample = sample_of(lens())
+    camera, augment = sample.pop("camera"), ct.augment.RandomMount(shift=(0.02, 0.02, 0.02))
+    samples = [{name: share * value for name, value in sample.items()} for share in (1.0, 0.9)]
+    listed = {"image": [one["image"] for one in samples], "distance": [one["distance"][plane] for one in samples]}
+    draw = augment.draw(2)
+    out = augment(listed, camera=camera, draw=draw)
+    for i, one in enumerate(samples):
+        alone = augment(one, camera=camera, draw={name: value[i : i + 1] for name, value in draw.items()})
+        torch.testing.assert_close(out["image"][i], alone["image"])
+        torch.testing.assert_close(out["distance"][i], alone["distance"][plane])

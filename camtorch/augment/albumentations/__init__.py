@@ -136,11 +136,13 @@ class Transform(FrontEnd, A.DualTransform):
 
     def _source(self, data: dict[str, Any]) -> Camera:
         """Return the camera of a sample's images."""
-        sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]
-        given = self.camera if data.get("camera") is None else data["camera"]
+        given = {name: data[name] for name in ("image", "mask", "images", "masks") if data.get(name) is not None}
+        planes = {name: value[:1] if name in ("images", "masks") else [value] for name, value in given.items()}
+        sizes = [(name, np.shape(one)[:2]) for name, several in planes.items() for one in several]
+        camera = self.camera if data.get("camera") is None else data["camera"]
         matrices = ((name, value) for name, value in data.items() if value is not None and self._is_matrix(name, value))
         return camera_of_sample(
-            _OWNER, given, self.augmentation.camera, self.augmentation.needs_camera, sizes, next(matrices, None)
+            _OWNER, camera, self.augmentation.camera, self.augmentation.needs_camera, sizes, next(matrices, None)
         )
 
     def _is_matrix(self, name: str, value: Any) -> bool:

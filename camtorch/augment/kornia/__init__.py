@@ -1,7 +1,8 @@
 """Augmentations for kornia, in AugmentationSequential and VideoSequential, for every data key, next to kornia's own.
 
 Fields of a dict (`data_keys=None`) that kornia does not know move by their names, as in `Augmentation`, and are
-returned with their validity. Numbers under an unknown name that might be geometry raise an error; `fields={"lidar":
+returned with their validity; a dict gets the `crop_place` of `BoxCrop(place=True)` too, with the `rotation` and the
+`camera` from which it follows. Numbers under an unknown name that might be geometry raise an error; `fields={"lidar":
 "points", "logits": "keep"}` of the augmentation gives their kinds. A "camera" is the camera of the images; the result
 holds the new one. Next to such fields, kornia's own augmentations that move pixels raise an error, as they would not
 move the fields.
@@ -23,7 +24,7 @@ from torch import Tensor
 
 from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.cameras import check_single
+from camtorch.augment.cameras import check_single, known_camera
 from camtorch.augment.change import Change, Part
 from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.kornia.containers import wrap_containers
@@ -94,7 +95,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     ):
         name = type(self).__name__
         check_front_end(name, augmentation)
-        camera = Guess.instead(augmentation.camera if camera is None else camera, name)
+        camera = known_camera(Guess.instead(camera, name), augmentation.camera)
         if not isinstance(camera, (Camera, Guess)):
             raise TypeError(f"{name}: camera must be the Camera of the images; got {no_camera(camera)}")
         super().__init__(
@@ -117,7 +118,8 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     def _set_size(self, own_size: tuple[int, int]) -> None:
         """Tell kornia the size of new images of a size."""
         self.flags.pop("size", None)
-        if (size := self.augmentation.size_after(own_size)) != own_size:
+        size = self.augmentation._size_if_applied(own_size) if self.p else own_size
+        if size != own_size:
             self.flags["size"] = size
 
     def camera_for(self, size: Sequence[int]) -> Camera:

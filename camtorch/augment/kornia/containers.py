@@ -60,7 +60,8 @@ def _read_dict(container: Any, given: Sample, ours: list[FrontEnd]) -> _Dict:
             f"{owner}: a sample with {PLACE} must have the rotation that came with it, as it follows from that and the "
             f"camera; got {', '.join(given)}. Leave {PLACE} out, or keep the rotation"
         )
-    _check_others(container, [*kinds, *(["camera"] if rest.get("camera") is not None else [])])
+    moving = [*kinds, *(["camera"] if rest.get("camera") is not None else [])]
+    _check_others(container, [*moving, *(PLACE for one in ours if one.augmentation.place)])
     tables = {n for one in ours if one.augmentation.mirroring for n in one.augmentation.mirroring.by_name}
     fields = {n: rest[n] for n in unknown if n in kinds or n.removesuffix("_valid") in kinds or n in tables}
     fields |= {PLACE: rest[PLACE]} if rest.get(PLACE) is not None else {}
@@ -106,16 +107,24 @@ def _params_for(container: Any, camera: Any, image: Tensor | None, params: Any) 
 
 @on_samples
 def _fields_moved(part: Any, fields: Sample, params: Params, kinds: dict[str, str], back: bool) -> Sample:
-    """Move the fields of a dict that kornia does not know by one of ours, and return them with their flags."""
+    """Move the fields of a dict that kornia does not know by one of ours, and return them with their flags.
+
+    From an augmentation with `place`, `crop_place` comes out as well, and the rotation from which it follows.
+    """
     device = next((value.device for value in fields.values() if isinstance(value, Tensor)), torch.device("cpu"))
     clips = int(params["video_batch_size"]) if "video_batch_size" in params else None
     flat = {n: v.flatten(0, 1) for n, v in fields.items()} if clips else fields
     with torch.autocast(device.type, enabled=False):
         change = part.change(params, device)
-        moved = part.augmentation.moved_by(change.inverse() if back else change, flat, kinds, predicted=back)
-    if PLACE in fields and not back:
+        if kinds:
+            moved = part.augmentation.moved_by(change.inverse() if back else change, flat, kinds, predicted=back)
+        else:  # beside the crop's place
+            batched = not isinstance(fields, Single)
+            moved = {"rotation": change.rotation_for_sample(batched), "camera": change.camera_for_sample(batched)}
+    names = {*fields, PLACE, "rotation"} if part.augmentation.place else {*fields}
+    if PLACE in names and not back:
         put_place(flat, moved, type(part).__name__)
-    kept = {n: v for n, v in moved.items() if n in fields or n.removesuffix("_valid") in kinds}
+    kept = {n: v for n, v in moved.items() if n in names or n.removesuffix("_valid") in kinds}
     return {n: v.unflatten(0, (clips, -1)) for n, v in kept.items()} if clips else type(fields)(kept)
 
 
@@ -131,9 +140,14 @@ def _with_fields(
         params = _params_for(self, camera, read.image, params)
     result, fields = call(self, read.rest, params=params), read.fields
     applied = [pair for pair in parts_of(self._params if params is None else params, self) if pair[0] in ours]
+    kinds, with_camera = read.kinds, read.camera is not None
     for part, drawn in reversed(applied) if back else applied:
-        fields = _fields_moved(part, fields, drawn, read.kinds, back) if read.kinds else fields
-        if read.camera is not None:
+        adds_place = part.augmentation.place and not back
+        if kinds or adds_place:
+            fields = _fields_moved(part, fields, drawn, kinds, back)
+        if adds_place:  # it follows from both, also through later augmentations
+            kinds, with_camera = {**kinds, "rotation": "rotation"}, True
+        if with_camera:
             change: Change = part.change(drawn)
             cameras = change.source if back else change.target
             cameras = (cameras[0] if isinstance(read.fields, Single) else cameras).clone()
