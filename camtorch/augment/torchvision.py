@@ -9,7 +9,7 @@ The module is imported by name: `import camtorch.augment.torchvision`.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,7 +41,8 @@ except Exception as error:  # a binary that does not match fails with a RuntimeE
 
 _OWNER = "torchvision.Transform"
 _BY_TYPE = {
-    **dict.fromkeys((PIL.Image.Image, tv_tensors.Image, tv_tensors.Video), "image"),
+    tv_tensors.Image: "image",
+    tv_tensors.Video: "image",
     tv_tensors.Mask: "mask",
     tv_tensors.BoundingBoxes: "boxes",
     tv_tensors.KeyPoints: "keypoints",
@@ -65,7 +66,7 @@ class Transform(FrontEnd, v2.Transform):
     Plain tensors and arrays move by the name of their key, as in `Augmentation`: "gaze", "depth" and so on. An array of
     an image is (H, W, C) or (H, W). Labels of a clip may have its leading dims. Numbers under an unknown name that
     might be geometry raise an error; `fields={"lidar": "points", "logits": "keep"}` of the augmentation gives their
-    kinds. The name of a tuple's element is its place: `fields={"[1]": "keep"}`. As in v2, the first plain tensor is the
+    kinds. The name of a tuple's element is its index: `fields={"[1]": "keep"}`. As in v2, the first plain tensor is the
     image if the sample has no other image and its name means nothing else. `valid=True` adds a flag for each point or
     box of a dict: `target["keypoints_valid"]`, a bool tensor, for `target["keypoints"]`: on the new image, and valid
     before. Flags that a sample already has are always updated. Count, order, formats and dtypes stay; canvas_size is
@@ -113,79 +114,111 @@ class Transform(FrontEnd, v2.Transform):
 
         That function takes the moved sample and the change, and returns a nest like the given one.
         """
-        flat, spec = pytree.tree_flatten_with_path(given)
-        paths, leaves = [path for path, _ in flat], [leaf for _, leaf in flat]
-        names = [_name(path) for path in paths]
-        keys = _keys(paths, names)
-        fields = {i: _read_leaf(names[i], leaves[i], kind) for i, kind in self._kinds(flat, names).items()}
-        sizes = []
-        for i, (kind, value, _) in fields.items():
-            size = getattr(leaves[i], "canvas_size", None) or (value.shape[-2:] if kind in IMAGES else ())
-            sizes += [(type(leaves[i]).__name__, tuple(size))] if size else []
+        nest, augmentation = _Nest(given), self.augmentation
+        keys, leaves = nest.keys, nest.leaves
+        fields = {i: _read_leaf(nest.names[i], leaves[i], kind) for i, kind in self._kinds(nest).items()}
         cameras = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Camera)]
-        for name, count in (("camera", len(cameras)), (PLACE, names.count(PLACE))):
+        for name, count in (("camera", len(cameras)), (PLACE, nest.names.count(PLACE))):
             if count > 1:
                 raise ValueError(f"{_OWNER}: a sample must have one {name}; got {count}")
-        augmentation, given_camera = self.augmentation, leaves[cameras[0]] if cameras else self.camera
-        matrix = next(((keys[i], value) for i, (kind, value, _) in fields.items() if kind == "K"), None)
+        given_camera = leaves[cameras[0]] if cameras else self.camera
+        sizes = []
+        for i, field in fields.items():
+            size = field.value.shape[-2:] if field.kind in IMAGES else getattr(leaves[i], "canvas_size", None)
+            if size is not None:
+                sizes.append((type(leaves[i]).__name__, tuple(size)))
+        matrix = next(((keys[i], field.value) for i, field in fields.items() if field.kind == "K"), None)
         camera = camera_of_sample(_OWNER, given_camera, augmentation.camera, augmentation.needs_camera, sizes, matrix)
         is_guessed = matrix is None and isinstance(known_camera(given_camera, augmentation.camera), Guess)
         kinds = {keys[i]: field.kind or KEEP for i, field in fields.items()}
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
         sample = Frames({keys[i]: field.value for i, field in fields.items()}, camera=detached(camera))
         added = [name for name in (PLACE, "rotation") if augmentation.place and name not in sample]
-        added += ["camera"] if is_guessed or (augmentation.place and not cameras) else []
+        if is_guessed or (augmentation.place and not cameras):
+            added.append("camera")
 
         def write(moved: Sample, change: Change) -> Any:
+            stays, size = change.parts[0].moves is None, change.parts[0].image_size
             for i, field in fields.items():  # where nothing moves, PIL images and tv_tensors stay as they are
-                if change.parts[0].moves is not None or not field.kind or type(leaves[i]) in _HELD:
-                    leaves[i] = field.write(moved[keys[i]], change.parts[0].image_size)
+                if not (stays and field.kind) or type(leaves[i]) in _HELD:
+                    leaves[i] = field.write(moved[keys[i]], size)
             for i in cameras:
                 leaves[i] = moved["camera"]
-            result = pytree.tree_unflatten(leaves, spec)
+            result = pytree.tree_unflatten(leaves, nest.spec)
             if isinstance(result, dict):
                 result |= {name: moved[name] for name in added}
             for i in fields if self.valid else ():
-                path, valid = paths[i], moved.get(f"{keys[i]}_valid")
+                path, valid = nest.paths[i], moved.get(f"{keys[i]}_valid")
                 if valid is not None and path and isinstance(path[-1], pytree.MappingKey):
                     holder = functools.reduce(lambda held, step: step.get(held), path[:-1], result)
-                    holder.setdefault(f"{names[i]}_valid", valid if isinstance(leaves[i], Tensor) else valid.numpy())
+                    flags = valid if isinstance(leaves[i], Tensor) else valid.numpy()
+                    holder.setdefault(f"{nest.names[i]}_valid", flags)
             return result
 
         return sample, kinds, write
 
-    def _kinds(self, flat: list[Any], names: list[str]) -> dict[int, str | None]:
+    def _kinds(self, nest: _Nest) -> dict[int, str | None]:
         """Return the kind of each leaf that moves, and None for those that may be flags or orders of landmarks."""
         fields, problems = self.augmentation.fields, dict[int, ValueError]()
         kinds: dict[int, str | None] = {}
-        single = all(getattr(leaf, "ndim", 0) < 4 for _, leaf in flat)  # images of batches have as many dims
-        for i, ((path, leaf), name) in enumerate(zip(flat, names, strict=True)):
-            if leaf is None or isinstance(leaf, Camera) or name in OWN:
-                kinds |= {i: None} if name == PLACE else {}
-                continue
-            kinds[i] = next((kind for of, kind in _BY_TYPE.items() if isinstance(leaf, of)), None)
-            try:
-                if isinstance(leaf, PIL.Image.Image) and kind_of(name, [leaf], fields, _OWNER) == "mask":
-                    kinds[i] = "mask"
-                kinds[i] = kinds[i] or kind_of(name, _in_lists(leaf, path), fields, _OWNER, single)
-            except ValueError as error:
-                problems[i] = error
+        single = all(getattr(leaf, "ndim", 0) < 4 for leaf in nest.leaves)  # images of batches have as many dims
+        for i, (name, leaf) in enumerate(zip(nest.names, nest.leaves, strict=True)):
+            if name == PLACE:
+                kinds[i] = None
+            elif not (leaf is None or isinstance(leaf, Camera) or name in OWN):
+                try:
+                    kinds[i] = _kind(name, leaf, nest.paths[i], fields, single)
+                except ValueError as error:
+                    kinds[i], problems[i] = None, error
         if "image" not in kinds.values():
-            named = {name for name in names if name in fields or name.endswith("_valid") or pattern_of(name, fields)}
-            named.add(PLACE)
-            free = (i for i, kind in kinds.items() if not (kind or names[i] in named))
-            first = next((i for i in free if isinstance(flat[i][1], Tensor) and flat[i][1].ndim > 1), -1)
-            kinds |= {} if first < 0 else {first: "image"}
-            problems.pop(first, None)
+            unknown = (i for i, kind in kinds.items() if kind is None)
+            first = next((i for i in unknown if _may_be_image(nest.names[i], nest.leaves[i], fields)), None)
+            if first is not None:
+                kinds[first] = "image"
+                problems.pop(first, None)
         for problem in problems.values():
             raise problem
-        return {i: kind for i, kind in kinds.items() if kind or isinstance(flat[i][1], _HELD)}
+        return {i: kind for i, kind in kinds.items() if kind or isinstance(nest.leaves[i], _HELD)}
+
+
+class _Nest:
+    """The leaves of a sample, a nest of dicts, lists and tuples, in one order."""
+
+    def __init__(self, given: Any):
+        flat, self.spec = pytree.tree_flatten_with_path(given)
+        self.paths = [path for path, _ in flat]
+        self.leaves = [leaf for _, leaf in flat]
+        self.names = [_name(path) for path in self.paths]
+        self.keys = _keys(self.paths, self.names)  # the names, made distinct
 
 
 def _name(path: Any) -> str:
     """Return the last key of a path that is a word, or the whole path."""
     words = [getattr(step, "key", getattr(step, "name", None)) for step in path]
     return next((word for word in reversed(words) if isinstance(word, str)), pytree.keystr(path) or "[0]")
+
+
+def _keys(paths: list[Any], names: list[str]) -> list[str]:
+    """Return the names of leaves, with the path of what holds them in front if some are there twice."""
+    if len(set(names)) == len(names):
+        return names
+    whole = [name for name in (PLACE, "rotation") if names.count(name) == 1]  # of the whole sample
+    holders = [pytree.keystr(path[:-1] if path and isinstance(path[-1], pytree.MappingKey) else path) for path in paths]
+    return [name if name in whole else f"{holder}/{name}" for holder, name in zip(holders, names, strict=True)]
+
+
+def _kind(name: str, leaf: Any, path: Any, fields: Mapping[str, str], single: bool) -> str | None:
+    """Return the kind of a leaf by its type, else by its name."""
+    if isinstance(leaf, PIL.Image.Image):
+        return "mask" if kind_of(name, [leaf], fields, _OWNER) == "mask" else "image"
+    by_type = next((kind for of, kind in _BY_TYPE.items() if isinstance(leaf, of)), None)
+    return by_type or kind_of(name, _in_lists(leaf, path), fields, _OWNER, single)
+
+
+def _may_be_image(name: str, leaf: Any, fields: Mapping[str, str]) -> bool:
+    """Whether a leaf without a kind is a tensor whose name means nothing else."""
+    means_more = name in fields or name == PLACE or name.endswith("_valid") or pattern_of(name, fields) is not None
+    return isinstance(leaf, Tensor) and leaf.ndim > 1 and not means_more
 
 
 def _in_lists(leaf: Any, path: Any) -> Any:
@@ -197,15 +230,6 @@ def _in_lists(leaf: Any, path: Any) -> Any:
             break
         leaf = [leaf]
     return leaf
-
-
-def _keys(paths: list[Any], names: list[str]) -> list[str]:
-    """Return the names of leaves, with where they are in front if some are there twice."""
-    if len(set(names)) == len(names):
-        return names
-    whole = [name for name in (PLACE, "rotation") if names.count(name) == 1]  # of the whole sample
-    places = [pytree.keystr(path[:-1] if path and isinstance(path[-1], pytree.MappingKey) else path) for path in paths]
-    return [name if name in whole else f"{place}/{name}" for place, name in zip(places, names, strict=True)]
 
 
 class _Leaf(NamedTuple):
