@@ -75,7 +75,8 @@ def save_map(
             raise ValueError(f"save_map: options of {chosen.name} must be {takes}; got {option}")
     if chosen.suffixes and not name.lower().endswith(chosen.suffixes):
         raise ValueError(f"{name}: suffix must be one of {', '.join(chosen.suffixes)} for {chosen.name}; got another")
-    if not (exact := Exact(warp, "save_map")).shown.any():
+    exact = Exact(warp, "save_map")
+    if not exact.shown.any():
         raise ValueError(f"save_map: {name}: the target must show a part of the source's image; got none")
     content, facts = chosen.encode(name, exact, given)
     described = {"format": chosen.name, **dict(zip(SIZES, exact.source_size + exact.target_size, strict=True)), **facts}
@@ -134,7 +135,8 @@ def files_of(path: str | os.PathLike[str], format: str | None = None) -> tuple[s
 
 def _read_description(path: str) -> dict[str, Any]:
     """Return the description of a bare table, or an empty dict."""
-    if not os.path.isfile(beside := f"{path}.json"):
+    beside = f"{path}.json"
+    if not os.path.isfile(beside):
         return {}
     try:
         described = json.loads(read_bytes(beside, largest=1 << 16))
@@ -159,6 +161,7 @@ def _chosen(path: str, format: str | None) -> MapFormat:
 
 
 def _named(format: str) -> MapFormat:
-    if (found := _FORMATS.get(str(format).lower())) is None:
+    found = _FORMATS.get(str(format).lower())
+    if found is None:
         raise ValueError(f"format must be a known format of maps; got {format!r}; {_KNOWN}")
     return found

@@ -34,7 +34,8 @@ class Exact:
     def __init__(self, warp: Warp, owner: str):
         if not isinstance(warp, Warp):
             raise TypeError(f"{owner}: warp must be a Warp; got {type(warp).__name__}")
-        if (count := warp.batch_shape.numel()) != 1:
+        count = warp.batch_shape.numel()
+        if count != 1:
             raise ValueError(f"{owner}: warp must be a single one, as of camera[i]; got a batch of {count}")
         self.warp = warp
         self.source_size: tuple[int, int] = warp.source.size_for(owner)

@@ -154,7 +154,8 @@ def rounded(
         CameraFileError: If nodes of shown pixels are far below `low` or above `high`, unless `clip` is True.
     """
     beyond = ((mesh.nodes < low - _SLACK) | (mesh.nodes > high + _SLACK)).any(-1)
-    if mesh.needed is not None and not clip and (lost := beyond & mesh.needed).any():
+    lost = beyond if mesh.needed is None else beyond & mesh.needed
+    if mesh.needed is not None and not clip and lost.any():
         worst = mesh.nodes[lost]
         (left, top), (right, bottom) = worst.min(0), worst.max(0)
         raise CameraFileError(
@@ -196,7 +197,8 @@ def rounded(
             for x, y in itertools.product(either, either):
                 value = np.array([x[node][0], y[node][1]])
                 patch[node[0] - near[0].start, node[1] - near[1].start] = value
-                if (off := errors(patch, pixels)).max() < least_error:
+                off = errors(patch, pixels)
+                if off.max() < least_error:
                     least_error, best = float(off.max()), (node, value, pixels, off)
         if best is None:
             break

@@ -71,7 +71,8 @@ class OpenCV(MapFormat):
         found = arrays_of(content, _LARGEST_ARRAY) if content.startswith(b"PK") else _from_yaml(content)
         arrays = {name: array for name, array in found.items() if array is not None}
         first, second = arrays["map1"], arrays["map2"]
-        if is_fixed := first.dtype == np.int16:
+        is_fixed = first.dtype == np.int16
+        if is_fixed:
             rest = second.astype(np.uint16).astype(np.int64)
             positions = first + np.stack((rest % _PARTS, rest // _PARTS % _PARTS), -1) / _PARTS
         else:

@@ -72,11 +72,10 @@ class Call:
         nodes: Tensor | None = None,
         cells: Tensor | None = None,
         exact: Tensor | None = None,
-        out: Tensor | None = None,
     ):
         self._make = maker(images, images.shape[0], size)
-        result = self._make() if out is None else out
-        self._results = [] if out is not None else [result]  # of the first call
+        result = self._make()
+        self._results = [result]  # of the first call
         self._layout: torch.memory_format | None = None  # of the copies of images that lie oddly in memory
         self._is_copied = False  # whether results lie so as well
         if not is_quick(images, result, mode) and math.prod(images.shape[2:]) <= _MOST_COPIED * math.prod(size):
@@ -103,9 +102,9 @@ class Call:
                 job.exact, job.exact_stride = exact.data_ptr(), exact.stride(0)
         job.hold((grid, mapped, nodes, cells, exact))
 
-    def __call__(self, images: Tensor, out: Tensor | None = None) -> Tensor:
-        """Return the samples of images, written to `out` if given; that lies in memory as it did at first."""
-        result = (self._results.pop() if self._results else self._make()) if out is None else out
+    def __call__(self, images: Tensor) -> Tensor:
+        """Return the samples of images."""
+        result = self._results.pop() if self._results else self._make()
         if not self._tiles:
             return result
         if self._layout is not None:

@@ -21,9 +21,8 @@ from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
 from camtorch.warp.camera_pair import Route
-from camtorch.warp.grid import coarse
-from camtorch.warp.lattice import PixelPositions, Positions, straight_lattice
-from camtorch.warp.moving import placed
+from camtorch.warp.grid import placed
+from camtorch.warp.lattice import PixelPositions, Positions, coarse, straight_lattice
 from camtorch.warp.options import Options, PaddingMode, Sampler
 from camtorch.warp.panorama import lengths
 from camtorch.warp.sampling import SHRINKS, render
@@ -69,9 +68,8 @@ class UncheckedWarp(Warp):
         called = torch.compiler.is_compiling() and not torch.onnx.is_in_onnx_export()
         if called and self._edits_need_values(smooth) and not keeps_graph(images, *self.tensors):
             options = self.antialias, sampler.padding_mode, sampler
-            cameras = self.source, self.target, self.rotation
             matrix = None if self.map is None else map_as_tensor(self.map)
-            return compiled.warped(images, *cameras, self.tolerance, *options, matrix, _edited)
+            return compiled.warped(images, self.ends, self.tolerance, *options, matrix, _edited)
         route = route or self.route(images)
         edits = None if in_transform() else self._edits(sampler, smooth, route)
         if not edits:
@@ -103,7 +101,7 @@ class UncheckedWarp(Warp):
             return None
         if self._halvings is None:
             known = self.host or self  # the warp on the CPU, whose values need no wait
-            self._halvings = _halvings(known.positions("kept", sampler.padding_mode), known.sampled)
+            self._halvings = _halvings(known.positions("kept", sampler.padding_mode), known.sampled.source)
         return [ImageEdit(sampler.padding_mode, k) for k in self._halvings] if any(self._halvings) else None
 
     def _made(
@@ -116,26 +114,8 @@ class UncheckedWarp(Warp):
         out: Tensor | None = None,
     ) -> Tensor:
         """Return images made by one edit, of these rows or all; copies and resized ones may be written to `out`."""
-        if edit.move:  # copy pixels: a quarter turn swaps the axes, and a negative sign along an axis flips it
-            result = self._empty(images) if out is None else out
-            height, width = result.shape[-2:]
-            a, b, left, c, d, top = edit.move
-            view = images.mT if b else images
-            dims = [dim for dim, sign in ((-1, a + b), (-2, c + d)) if sign < 0]
-            if dims:  # torch cannot flip unsigned dtypes
-                signed = SIGNED.get(view.dtype)  # a view by dtype, even the same one, drops the gradient
-                view = view.flip(dims) if signed is None else view.view(signed).flip(dims).view(view.dtype)
-            # where the first pixel of the view goes: the map says it of pixel (0, 0), which a flip moves to the end
-            left -= (view.shape[-1] - 1) * (a + b < 0)
-            top -= (view.shape[-2] - 1) * (c + d < 0)
-            # the part of the result that the view covers, which may be empty
-            x, right = max(left, 0), min(left + view.shape[-1], width)
-            y, bottom = max(top, 0), min(top + view.shape[-2], height)
-            right, bottom = max(right, x), max(bottom, y)
-            if (x, y, right, bottom) != (0, 0, width, height):
-                result[:] = as_pixels(sampler.fill, result.dtype, result.device)
-            result[:, :, y:bottom, x:right] = view[..., y - top : bottom - top, x - left : right - left]
-            return result
+        if edit.move:
+            return _copied(images, edit.move, self._empty(images) if out is None else out, sampler.fill)
         if edit.box:
             left, top, right, bottom = edit.box
             made = _resized(images[..., top:bottom, left:right], self.image_size, sampler.mode, edit.flips)
@@ -182,9 +162,11 @@ class AffineWarp(UncheckedWarp):
         self.register_buffer("matrix", given.to(device, dtype), persistent=False)
         self.batch_shape: torch.Size = broadcast_shapes(self.batch_shape, given.shape[:-2])
         # an edit depends on numbers on the CPU alone: it is the same on every device, and waits for none
-        self._numbers: list[Rows] = given.reshape(-1, 2, 3).tolist() if given is matrix and are_concrete(given) else []
+        self._numbers: list[Rows] = []
         if not isinstance(matrix, Tensor):
             self._numbers = [matrix]
+        elif are_concrete(matrix):
+            self._numbers = matrix.reshape(-1, 2, 3).tolist()
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "map": self.map.detach() if isinstance(self.map, Tensor) else self.map}
@@ -253,6 +235,28 @@ def made_like(warp: Warp, source: Camera, target: Camera, rotation: Tensor | Non
     return make(source, target, rotation, **options)
 
 
+def _copied(images: Tensor, move: tuple[int, ...], result: Tensor, fill: tuple[float, ...]) -> Tensor:
+    """Copy pixels to where a map in whole numbers moves them, put `fill` elsewhere, and return the result."""
+    # a quarter turn swaps the axes, and a negative sign along an axis flips it
+    a, b, left, c, d, top = move
+    view = images.mT if b else images
+    flips = [dim for dim, sign in ((-1, a + b), (-2, c + d)) if sign < 0]
+    if flips:  # torch cannot flip unsigned dtypes
+        signed = SIGNED.get(view.dtype)  # a view by dtype, even the same one, drops the gradient
+        view = view.flip(flips) if signed is None else view.view(signed).flip(flips).view(view.dtype)
+    # where the first pixel of the view goes: the map says it of pixel (0, 0), which a flip moves to the end
+    left -= view.shape[-1] - 1 if -1 in flips else 0
+    top -= view.shape[-2] - 1 if -2 in flips else 0
+    # the part of the result that the view covers, which may be empty
+    height, width = result.shape[-2:]
+    x, y = max(left, 0), max(top, 0)
+    right, bottom = max(min(left + view.shape[-1], width), x), max(min(top + view.shape[-2], height), y)
+    if (x, y, right, bottom) != (0, 0, width, height):
+        result[:] = as_pixels(fill, result.dtype, result.device)
+    result[:, :, y:bottom, x:right] = view[..., y - top : bottom - top, x - left : right - left]
+    return result
+
+
 def _resized(images: Tensor, size: Sequence[int], mode: str = "bilinear", flips: tuple[int, ...] = ()) -> Tensor:
     """Return images resized by torch with antialiasing, then flipped."""
     plain = images.dtype in _PLAIN_DTYPES
@@ -266,10 +270,9 @@ def _edit_of(
 ) -> ImageEdit:
     """Return how a map edits images of one size into another; torch resizes if more than `least` pixels become one."""
     (a, b, left), (c, d, top) = rows
-    whole = tuple(round(x) for x in (a, b, left, c, d, top))
-    near = all(abs(x - n) < _MAP_ROUNDING for x, n in zip((a, b, left, c, d, top), whole, strict=True))
-    if near and abs(a) + abs(b) == abs(c) + abs(d) == 1 and padding == "zeros":
-        return ImageEdit(padding, move=whole)
+    move = _whole((a, b, left, c, d, top), _MAP_ROUNDING)
+    if move and abs(a) + abs(b) == abs(c) + abs(d) == 1 and padding == "zeros":
+        return ImageEdit(padding, move=move)
     # two opposite corners of the target, as places on the source from the outer corner of its first pixel
     (a, b, left), (c, d, top) = inverted(rows)
     corners = (-0.5, -0.5), (target[1] - 0.5, target[0] - 0.5)
@@ -278,13 +281,18 @@ def _edit_of(
     slack = _INVERSE_ROUNDING
     is_inside = min(x, y) > -slack and right < source[1] + slack and bottom < source[0] + slack
     # a box of whole pixels that shrinks is resized; others are sampled, and may be halved first
-    box = tuple(round(edge) for edge in (x, y, right, bottom))
-    near = all(abs(edge - n) < slack for edge, n in zip((x, y, right, bottom), box, strict=True))
-    if near and is_inside and b == 0 and max(abs(a), abs(d)) > least:
+    box = _whole((x, y, right, bottom), slack)
+    if box and is_inside and b == 0 and max(abs(a), abs(d)) > least:
         return ImageEdit(padding, box=box, flips=tuple(dim for dim, sign in ((-1, a), (-2, d)) if sign < 0))
     halvings = _halved((math.hypot(a, c) + math.hypot(b, d)) / 2) if decides else 0
     # a target inside of the source, up to the outer edges of its pixels, needs no padding
     return ImageEdit("border" if is_inside and padding == "zeros" else padding, halvings)
+
+
+def _whole(numbers: Sequence[float], slack: float) -> tuple[int, ...]:
+    """Return numbers that are whole up to a slack as integers; nothing if one of them is not."""
+    whole = tuple(round(number) for number in numbers)
+    return whole if all(abs(number - n) < slack for number, n in zip(numbers, whole, strict=True)) else ()
 
 
 def _halved(scale: float) -> int:

@@ -21,9 +21,8 @@ from camtorch.projection.native_calls import Lattices, NativeMove, run_and_follo
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 from camtorch.warp.camera_pair import CameraPair
-from camtorch.warp.grid import FEWEST_CELLS, MOST_KEPT_NODES, coarse, probes
+from camtorch.warp.lattice import FEWEST_CELLS, MOST_KEPT_NODES, coarse, probes
 from camtorch.warp.options import Options, Sampler, serving_all
-from camtorch.warp.panorama import goes_round
 from camtorch.warp.sampling import SHRINKS, SURELY
 
 Label = Literal["pixels", "boxes", "rays", "columns", "pose", "rotation vectors"]
@@ -43,8 +42,8 @@ _FLAGS_OF_PIXELS = 1 << structs.LEFT_BITS  # flags of pixels stand above those o
 
 def natives_of(warp: CameraPair) -> tuple[Native, Native, Tensor | None] | None:
     """Return source, target and rotation of a warp for native code; None if it has to go step by step."""
-    source, target, rotation = warp.source, warp.target, warp.rotation
-    if not warp.moves_by_cameras or warp.is_pinned or goes_round(source) is not None or goes_round(target) is not None:
+    source, target, rotation = ends = warp.ends
+    if not warp.moves_by_cameras or warp.is_pinned or ends.goes_round:
         return None
     made = native_forms((source, target), target.intrinsics, *(() if rotation is None else (rotation,)))
     return None if made is None else (*made[0], rotation)  # type: ignore[return-value]
@@ -72,16 +71,13 @@ def call_for(
         batched: whether there is a dim B.
     """
     tolerance, antialias = options["tolerance"], options["antialias"]
-    count = len(values[0]) if batched else 1
     if not tolerance or antialias:
         return None
+    count = len(values[0]) if batched else 1
     if count > 1:
         threads = thread_count()
         if dtype != torch.float32 or (count % threads and count < _SAMPLES_PER_THREAD * threads):
             return None
-    given = sizes, dtype, tolerance, antialias is None, batched
-    forms = [(t.shape, t.stride(), t.dtype, how) for t, how in zip(values, hows, strict=True)]
-    calls: Kept = _calls.__dict__.setdefault("kept", Kept(4))
 
     def made() -> SampleCall | None:
         n, m = (math.ceil(side / structs.STEP) for side in sizes[1])
@@ -97,9 +93,11 @@ def call_for(
                 serves = torch.promote_types(value.dtype, dtype) == dtype
             if not serves:
                 return None
-        return SampleCall(*given, count, values, hows)
+        return SampleCall(sizes, dtype, options, values, hows, batched)
 
-    return calls((), (*given, *forms), made)
+    forms = [(t.shape, t.stride(), t.dtype, how) for t, how in zip(values, hows, strict=True)]
+    calls: Kept = _calls.__dict__.setdefault("kept", Kept(4))
+    return calls((), (sizes, dtype, tolerance, antialias, batched, *forms), made)
 
 
 _calls = threading.local()  # a thread keeps calls of its last four forms, which have memory of their own
@@ -127,6 +125,11 @@ def _surely_keeps_size(back: NativeMove, sizes: Sizes) -> bool:
         total = total + (np.hypot(steps[..., 0], steps[..., 1]) * both).sum((1, 2))
         count = count + both.sum((1, 2))
     return bool((total < SURELY * SHRINKS * step * np.maximum(count, 1)).all())
+
+
+def _is_averaged(value: Tensor, how: Sampler | Label) -> bool:
+    """Whether a value is an image whose pixels are averaged."""
+    return isinstance(how, Sampler) and how.mode != "nearest" and value.dtype != torch.bool
 
 
 def _as_images(value: Tensor, batched: bool) -> Tensor:
@@ -160,27 +163,27 @@ class SampleCall:
         self,
         sizes: Sizes,
         dtype: torch.dtype,
-        tolerance: float,
-        decides: bool,
-        batched: bool,
-        count: int,
+        options: Options,
         values: Sequence[Tensor],
         hows: Sequence[Sampler | Label],
+        batched: bool,
     ):
-        """Take the arguments of `call_for`; decides: whether images that shrink are antialiased, unlike here."""
-        self._sizes, self._dtype, self._count, self._batched = sizes, dtype, count, batched
+        """Take the arguments of `call_for`."""
+        self._sizes, self._dtype, self._batched = sizes, dtype, batched
+        self._count = count = len(values[0]) if batched else 1
         # the lattice by which all images are sampled
         samplers = [how for how in hows if isinstance(how, Sampler)]
         padding = serving_all("zeros", *(how.padding_mode for how in samplers))
         with torch.inference_mode(False):
-            self._lattices = Lattices(probes(0, sizes[1], dtype), sizes[1], sizes[0], tolerance, padding, count)
+            nodes, tolerance = probes(0, sizes[1], dtype), float(options["tolerance"] or 0)
+            self._lattices = Lattices(nodes, sizes[1], sizes[0], tolerance, padding, count)
         # arrays of C: a job for each image, a move for pixels and boxes, and a turn for rays and the like
         images, moving = len(samplers), sum(how in ("pixels", "boxes") for how in hows)
         self._jobs = (structs.Job * images)()
         moves = (structs.Move * moving)()
         turns = (structs.Turned * (len(hows) - images - moving))()
         call = self._call = structs.Together(job_count=images, move_count=moving, turned_count=len(turns))
-        call.jobs, call.moves, call.turned = (call.keep(array) for array in (self._jobs, moves, turns))
+        call.jobs, call.moves, call.turned = call.keep(self._jobs), call.keep(moves), call.keep(turns)
         call.lattices = self._lattices.struct
         self._back = call.lattices.move  # from the target to the source, which images are sampled by
         if count > 1:  # C samples images as soon as their lattice is made
@@ -190,12 +193,12 @@ class SampleCall:
         self._most_tiles = 1  # of the images, each of which threads share
         self._readers: list[Reader] = []  # of each value
         self._copied: list[int] = []  # which values C reads from copies
-        self._decides = False  # whether each run asks if images shrink, which are antialiased elsewhere
+        # whether each run asks if images shrink: these are halved elsewhere
+        self._may_halve = options["antialias"] is None and any(map(_is_averaged, values, hows))
         free_jobs, free_moves, free_turns = iter(self._jobs), iter(moves), iter(turns)
         for i, (value, how) in enumerate(zip(values, hows, strict=True)):
             if isinstance(how, Sampler):
                 reader = self._reader_of_images(next(free_jobs), value, how)
-                self._decides |= decides and how.mode != "nearest" and value.dtype != torch.bool
             elif how in ("pixels", "boxes"):
                 reader = self._reader_of_pixels(next(free_moves), value, 2 if how == "pixels" else 4)
                 if value.dtype != dtype or not value.is_contiguous():
@@ -204,7 +207,7 @@ class SampleCall:
                 reader = self._reader_of_vectors(next(free_turns), value, how)
             self._readers.append(reader)
         self._images_of_call = images if count == 1 else 0  # those of a batch are made with their lattices
-        self._one_thread = self._most_tiles <= _TILES_FOR_ONE_THREAD or not self._images_of_call  # whether it makes all
+        self._is_small = self._most_tiles <= _TILES_FOR_ONE_THREAD or not self._images_of_call  # one thread makes all
         self._may_be_refused = [i for i, how in enumerate(hows) if how in ("boxes", "pose", "rotation vectors")]
 
     def _reader_of_images(self, job: structs.Job, like: Tensor, how: Sampler) -> Reader:
@@ -267,32 +270,34 @@ class SampleCall:
         None if the call does not serve. Those of boxes, poses and rotation vectors alone are None if some take more
         than their outline, or are none.
         """
-        dtype, turn, step = self._dtype, None, 0
+        call, back, dtype = self._call, self._back, self._dtype
+        turn, step = None, 0  # the address of the rotations, and how many numbers further the next one lies
         if rotation is not None:
             if rotation.dtype != dtype or not rotation.is_contiguous():
                 rotation = rotation.detach().to(dtype).contiguous()
             turn = rotation.data_ptr()
-            step = 9 if rotation.ndim > 2 and len(rotation) > 1 else 0  # numbers, from one rotation to the next one
-        if self._decides:
+            step = 9 if rotation.ndim > 2 and len(rotation) > 1 else 0
+        if self._may_halve:
             turns = None if rotation is None else rotation.mT
             if not _surely_keeps_size(NativeMove(target, source, turns, self._sizes[0], False), self._sizes):
                 return None
         # what a draw changes: cameras and rotation, and where values and results lie
-        call, back, native, threads = self._call, self._back, loaded(), thread_count()
         target.add_table()
         if call.move_count:
             source.add_table()
-        back.from_, back.to, back.turns, back.turn_strides[0] = target.pointer, source.pointer, turn, step
+        back.from_, back.to = target.pointer, source.pointer
+        back.turns, back.turn_strides[0] = turn, step
         if self._copied:
             values = [value.to(dtype).contiguous() if i in self._copied else value for i, value in enumerate(values)]
         results: list[MovedField | None] = [read(one, step) for read, one in zip(self._readers, values, strict=True)]
+        native, threads = loaded(), thread_count()
         # images of a batch, by the threads that make the lattices
         if self._count > 1 and len(self._jobs):
             run, counters = native.camtorch_lattices, self._lattices.counters
             if run_and_follow(run, call.lattices, self._count, counters, target, source):
                 return None
         # all else, again if a limit of a camera was missing; images too if one thread makes them, else their lattice
-        one_thread = self._one_thread or threads == 1
+        one_thread = self._is_small or threads == 1
         call.job_count, call.is_whole = self._images_of_call, one_thread
         while flags := native.camtorch_together(call):
             if flags & structs.LEFT_MOST:

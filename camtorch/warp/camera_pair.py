@@ -38,15 +38,13 @@ from camtorch.evaluate.export import with_values
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import is_unknown
 from camtorch.native.sampler import Call, maker
-from camtorch.poses.rotations import transposed
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
 from camtorch.warp import compiled
-from camtorch.warp.grid import local_scale, locate
+from camtorch.warp.grid import Between, local_scale, locate
 from camtorch.warp.lattice import PixelPositions, Positions
-from camtorch.warp.moving import moved_pixels
 from camtorch.warp.options import Mode, Options, PaddingMode, Sampler, serving_all
-from camtorch.warp.panorama import Seam, seam_of, with_seam
+from camtorch.warp.panorama import Seam, seam_of
 from camtorch.warp.sampling import Pyramid, by_torch, laid_as, prepared, render
 
 Route = Literal["operator", "strips", "graph", "kept"]
@@ -188,47 +186,40 @@ class CameraPair(GeometryModule):
     @property
     def tensors(self) -> list[Tensor]:
         """All tensors that positions depend on."""
-        (source, target), rotation = self._ends, self.rotation
-        found = [*source.tensors, *target.tensors]
-        return found if rotation is None else [*found, rotation]
+        source, target, rotation = self.ends
+        return [*source.tensors, *target.tensors, *(() if rotation is None else (rotation,))]
 
     @property
     def form(self) -> tuple[object, ...]:
         """All that positions depend on in addition to `tensors`."""
-        source, target = self._ends
-        return source.form, target.form, self.rotation is None, self.antialias, self._tolerance
+        source, target, rotation = self.ends
+        return source.form, target.form, rotation is None, self.antialias, self._tolerance
 
     @property
-    def _ends(self) -> tuple[Camera, Camera]:
-        """Source and target by which positions are found, behind their shutters.
-
-        So there are three sources: `source` is the given one, `_ends[0]` is behind its shutter, and `sampled` is that
-        with images that `seam` lengthens.
-        """
-        return self.source, self.target
+    def ends(self) -> Between:
+        """Source, target and rotation by which pixels move: cameras that have shutters are behind them."""
+        parts: Any = self._modules
+        return Between(parts["source"], parts["target"], self.rotation)
 
     @property
     def seam(self) -> Seam | None:
         """The `Seam` that lengthens the source's images before they are sampled; None if they stay."""
-        return seam_of(self._ends[0])
+        return seam_of(self.ends.source)
 
     @property
-    def sampled(self) -> Camera:
-        """The source as the camera of the images that are sampled, see `_ends`."""
-        return with_seam(self._ends[0], self.seam)
+    def sampled(self) -> Between:
+        """The `ends` by which positions are found: the source is the camera of the images that `seam` lengthens."""
+        ends, seam = self.ends, self.seam
+        return ends if seam is None else ends._replace(source=seam.camera_of(ends.source))
 
     def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Positions:
         """Return positions of some rows of the target, which serve a padding, within a tolerance."""
-        source, target = self._ends
-        sampled = with_seam(source, self.seam)
-        return locate(sampled, target, self.rotation, tolerance, bool(self.antialias), rows, padding)
+        return locate(self.sampled, rows, tolerance, padding, bool(self.antialias))
 
     def move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
-        """Return pixels of the source on the target's image, or back, and whether there is one; see `moved_pixels`."""
-        (source, target), rotation = self._ends, self.rotation
-        if back:
-            source, target, rotation = target, source, transposed(rotation)
-        return moved_pixels(source, target, rotation, pixels, on_image)
+        """Return pixels of the source on the target's image, or back, and whether there is one; see `Between.move`."""
+        ends = self.ends
+        return (ends.back if back else ends).move(pixels, on_image)
 
     def route(self, images: Tensor | None = None) -> Route:
         """Return the route of images, or of positions alone; `locate` and `render` choose the lattice and the sampler.
@@ -244,7 +235,7 @@ class CameraPair(GeometryModule):
             return "graph"
         if torch.compiler.is_compiling():  # sizes that a program leaves open would be bounded in it by a comparison
             return "operator" if images is not None and self.goes_by_operator(images) else "kept"
-        if is_pinned or math.prod((*self.batch_shape, *self.target.size_for("Warp"))) <= _MOST_KEPT_PIXELS:
+        if is_pinned or math.prod((*self.batch_shape, *self.image_size)) <= _MOST_KEPT_PIXELS:
             return "kept"
         looks = all(t.is_cpu and not is_unknown(t) for t in self.tensors)
         return "strips" if looks and (images is None or not in_graph(images)) else "kept"
@@ -281,18 +272,16 @@ class CameraPair(GeometryModule):
     def warped(self, images: Tensor, sampler: Sampler, route: Route | None = None) -> Tensor:
         """Return the warped images (B, C, H', W') of checked images (B, C, H, W), whose route may be known."""
         route = route or self.route(images)
+        if route == "strips":
+            cameras = math.prod(self.batch_shape)
+            result = maker(images, len(images) if cameras == 1 else cameras, self.image_size)()
+            for rows, part, _ in self.in_strips(images, sampler):
+                result[:, :, rows] = part
+            return result
         given, images = images, self.lengthened(images)
         if route == "operator":
             options = self.tolerance, self.antialias, serving_all(self.padding_mode, sampler.padding_mode), sampler
-            return compiled.warped(images, self.sampled, self.target, self.rotation, *options)
-        if route == "strips":
-            cameras = math.prod(self.batch_shape)
-            result = maker(images, len(images) if cameras == 1 else cameras, self.target.size_for("Warp"))()
-            kept: dict[int, Pyramid] = {}
-            for rows, where in self.strip_positions(sampler.padding_mode):
-                with torch.no_grad():
-                    render(images, where, sampler, kept, result[:, :, rows])
-            return result
+            return compiled.warped(images, self.sampled, *options)
         known: KeptPositions | None = self._kept.result
         where = self.positions(route, sampler.padding_mode)
         call = prepared(images, where, sampler)
@@ -320,8 +309,9 @@ class CameraPair(GeometryModule):
                     "that do. Use torch.onnx.export(dynamo=True) or torch.export; or make the map a constant by "
                     "warp.requires_grad_(False)"
                 )
-            return self.locate(range(self.target.size_for("Warp")[0]), served, tolerance)
-        if records_constants() and (constant := self._constant(padding)):
+            return self.locate(range(self.image_size[0]), served, tolerance)
+        constant = self._constant(padding) if records_constants() else None
+        if constant is not None:
             return constant
         with set_aside() if is_traced else nullcontext():
             # exact positions serve every padding, so one entry is enough
@@ -340,17 +330,22 @@ class CameraPair(GeometryModule):
     def computed(self, padding: PaddingMode, tolerance: float) -> Positions:
         """Return the positions of all pixels, without a graph, which serve a padding."""
         if tolerance:
-            if not self.antialias and (host := self.host) is not None:
+            host = None if self.antialias else self.host
+            if host is not None:
                 return host.positions("kept", padding).on(self.target.intrinsics.device)
             if self.goes_by_operator():
-                planes, mapped = compiled.positions(self.sampled, self.target, self.rotation, tolerance, padding)
+                sampled = self.sampled
+                planes, mapped = compiled.positions(*sampled, tolerance, padding)
                 grid = planes.movedim(1, -1)
-                return PixelPositions(grid, mapped, local_scale(grid, mapped, self.sampled) if self.antialias else None)
-        return self.locate(range(self.target.size_for("Warp")[0]), padding, tolerance)
+                scale = local_scale(grid, mapped, sampled.source) if self.antialias else None
+                return PixelPositions(grid, mapped, scale)
+        return self.locate(range(self.image_size[0]), padding, tolerance)
 
-    def strip_positions(self, padding: PaddingMode = "zeros", count: int | None = None) -> Iterator[tuple[slice, Any]]:
+    def strip_positions(
+        self, padding: PaddingMode = "zeros", count: int | None = None
+    ) -> Iterator[tuple[slice, Positions]]:
         """Yield rows of the target, `count` at a time, and their positions on the source's image."""
-        height, width = self.target.size_for("Warp")
+        height, width = self.image_size
         step = count or max(_STRIP_PIXELS // (max(math.prod(self.batch_shape), 1) * width), 1)
         for top in range(0, height, step):
             rows = range(top, min(top + step, height))
@@ -358,18 +353,20 @@ class CameraPair(GeometryModule):
                 where = self.locate(rows, serving_all(self.padding_mode, padding), self.tolerance)
             yield slice(rows.start, rows.stop), where
 
-    def in_strips(self, images: Tensor, count: int | None, sampler: Sampler) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """Yield rows of the target, images of them, and the mask of `on_image`."""
-        kept: dict[int, Pyramid] = {}
+    def in_strips(
+        self, images: Tensor, sampler: Sampler, count: int | None = None
+    ) -> Iterator[tuple[slice, Tensor, Positions]]:
+        """Yield rows of the target, `count` at a time, images of them, and their positions."""
+        pyramids: dict[int, Pyramid] = {}
         images = self.lengthened(images)
         for rows, where in self.strip_positions(sampler.padding_mode, count):
             with torch.no_grad():
-                part, valid = render(images, where, sampler, kept), self.on_image(where)
-            yield rows, part, valid
+                part = render(images, where, sampler, pyramids)
+            yield rows, part, where
 
     def on_image(self, where: Positions) -> Tensor:
         """Whether the source maps pixels onto its image, (B or 1, 1, h, W')."""
-        grid, source = where.pixels.grid.detach(), self.sampled
+        grid, source = where.pixels.grid.detach(), self.sampled.source
         pixels = (grid + 1) * grid.new_tensor(source.size_for("Warp")[::-1]) / 2 - 0.5
         return (where.pixels.mapped & source.contains(pixels)).unsqueeze(1)
 

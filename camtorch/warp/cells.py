@@ -1,7 +1,7 @@
-"""The cells of a lattice: which of them polynomials through nodes may miss, and what is laid there instead.
+"""A lattice by torch: which of its cells polynomials through nodes may miss, and what is laid there instead.
 
 `classify` tells a cell's kind by its nodes; cells in doubt are settled by exact positions. To lay a cell is to write
-positions of its pixels: `lay_quintics` does so here, and `grid.py` with exact ones.
+positions of its pixels: `lay_exact` does so, and `lay_quintics`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
+from camtorch.native import sampler
+from camtorch.native.library import native_available
 from camtorch.native.structs import (
     CELL_CUBIC,
     CELL_DOUBT,
@@ -26,6 +28,7 @@ from camtorch.native.structs import (
     CELL_TODO,
     STEP,
 )
+from camtorch.warp.lattice import Lattice, probes
 
 Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Pixels (h, w, 2) for every camera, or (B, h, w, 2) for each its own, to positions (B or 1, h, w, 2) as of
@@ -38,6 +41,50 @@ _PROBES = ((4, 0), (0, 4), (8, 4), (4, 8), (4, 4))
 """Pixels, across and down in a cell, at which polynomials miss most: the middles of its sides, and its own."""
 _MIDDLE = {4: (0.0, -1 / 16, 9 / 16, 9 / 16, -1 / 16, 0.0), 6: tuple(w / 256 for w in (3, -25, 150, 150, -25, 3))}
 """Weights of six nodes half-way between the middle two: in a cubic through 4 of them, and in a quintic through 6."""
+
+
+def found_by_torch(
+    exact: Exact,
+    like: Tensor,
+    first: int,
+    size: tuple[int, int],
+    source: tuple[int, int],
+    tolerance: float,
+    padding: str,
+    learns: bool,
+) -> Lattice | None:
+    """Return the lattice of `grid.on_lattice` by torch, as of several models in a batch, or without the library.
+
+    like: has the dtype and the device of pixels. first, size: of the rows of the target. source: the size of its image.
+    learns: whether nodes and exact cells are computed again with a graph.
+    """
+    n, m = (math.ceil(side / STEP) for side in size)
+    # the library finds cubics for each cell; torch alone first looks one node further, whether quintics do everywhere
+    looks_further = not (learns or native_available())
+    shape = (n + 7, m + 7) if looks_further else (n + 5, m + 5)
+    positions, mapped = (t[:, 0] for t in exact(probes(first, size, like.dtype, shape[0] - n)))
+    count = math.prod(shape)  # after so many nodes the rim follows
+    nodes = positions[:, :count].movedim(-1, 1).contiguous().unflatten(2, shape)
+    if looks_further:
+        is_smooth = bool(mapped.all()) and are_smooth(nodes, source, tolerance)
+        nodes = nodes[:, :, 1:-1, 1:-1].contiguous()
+        if is_smooth:
+            cells = torch.full((len(nodes), n, m), CELL_QUINTIC, dtype=torch.int32, device=nodes.device)
+            return Lattice(nodes, cells, nodes.new_empty(2, 0, STEP, STEP), size)
+    # cells of cubics: where the nodes show that these serve, or, in doubt, exact positions do
+    narrow, rim = nodes.float(), mapped[:, count:]
+    mapped = mapped[:, :count].unflatten(1, shape)
+    mapped = mapped[:, 1:-1, 1:-1].contiguous() if looks_further else mapped
+    find = sampler.classify if native_available() else classify
+    cells = find(narrow, mapped, rim, size, source, tolerance, padding)
+    settle(exact, first, cells, narrow, mapped, source, tolerance, padding)
+    todo = cells == CELL_TODO
+    if not len(cells) or int(todo.sum((1, 2)).max()) > n * m * (1 / 5 if learns else 7 / 8):
+        return None
+    laid = lay_exact(exact, like, first, cells, todo)
+    if not learns:
+        laid = torch.cat((laid, lay_quintics(nodes, cells, laid.shape[1])), 1)
+    return Lattice(nodes, cells, laid, size)
 
 
 def classify(
@@ -180,6 +227,34 @@ def put(cells: Tensor, chosen: Tensor, wanted: Tensor, kinds: Tensor) -> None:
     """Write kinds (B, K) into the chosen cells that are wanted."""
     flat = cells.flatten(1)
     flat.scatter_(1, chosen, torch.where(wanted, kinds.to(cells.dtype), flat.gather(1, chosen)))
+
+
+def lay_exact(exact: Exact, like: Tensor, first: int, cells: Tensor, todo: Tensor) -> Tensor:
+    """Return exact positions (2, K, 8, 8) of the cells to do (B, n, m), and write their places into `cells`.
+
+    Where what is mapped ends in one, its neighbours follow.
+    """
+    parts = [like.new_empty(2, 0, STEP, STEP)]
+    count = 0  # of the cells laid so far, whose numbers are their places
+    done = torch.zeros_like(todo)
+    offset = torch.arange(STEP, dtype=like.dtype, device=like.device)
+    while bool(todo.any()):
+        chosen, wanted = places(todo)
+        i, j = chosen // todo.shape[2], chosen % todo.shape[2]
+        down = i[..., None, None] * STEP + offset[:, None]
+        across = j[..., None, None] * STEP + offset
+        pixels = torch.stack(torch.broadcast_tensors(across, down + first), -1)  # (B, most, 8, 8, 2)
+        positions, known = exact(pixels.flatten(2, 3))
+        part = torch.where(known, positions.movedim(-1, 0), torch.nan)
+        parts.append(part.flatten(1, 2).unflatten(-1, (STEP, STEP)))
+        put(cells, chosen, wanted, torch.arange(count, count + chosen.numel(), device=cells.device).view_as(chosen))
+        count += chosen.numel()
+        done |= todo
+        # the limit may go on in cells around, though their nodes do not show it
+        limit = torch.zeros_like(todo).flatten(1).scatter_(1, chosen, wanted & known.any(-1) & ~known.all(-1))
+        around = F.max_pool2d(limit.view_as(todo).to(like.dtype).unsqueeze(1), 3, 1, 1)[:, 0]
+        todo = (around > 0) & ~done
+    return torch.cat(parts, 1)
 
 
 def lay_quintics(nodes: Tensor, cells: Tensor, count: int) -> Tensor:

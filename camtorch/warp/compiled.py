@@ -20,7 +20,7 @@ from camtorch.cameras.operators import CameraNumbers, opaque
 from camtorch.evaluate.kept import Kept
 from camtorch.native.sampler import layout
 from camtorch.values.arguments import broadcast_shapes
-from camtorch.warp.grid import locate
+from camtorch.warp.grid import Between, locate
 from camtorch.warp.options import Sampler
 from camtorch.warp.sampling import render
 
@@ -46,15 +46,13 @@ def positions(
 ) -> tuple[Tensor, Tensor]:
     """Return the positions of all target pixels, planes (B or 1, 2, H', W'), and whether they are mapped."""
     every = range(target.size_for("Warp")[0])
-    grid, mapped = locate(source, target, rotation, tolerance, False, every, padding).pixels[:2]
+    grid, mapped = locate(Between(source, target, rotation), every, tolerance, padding, False).pixels[:2]
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
 
 
 def warped(
     images: Tensor,
-    source: Camera,
-    target: Camera,
-    rotation: Tensor | None,
+    cameras: Between,
     tolerance: float,
     antialias: bool | None,
     padding: str,
@@ -63,6 +61,7 @@ def warped(
     by: Callable[..., tuple[Tensor, ...]] | None = None,
 ) -> Tensor:
     """Return warped images (B, C, h, w); an edit passes its `matrix` and, in `by`, its own operator. See `Warp`."""
+    source, target, rotation = cameras
     turned = None if rotation is None else rotation.detach()
     options = written(antialias, padding, how)
     is_last = str(layout(images) == torch.channels_last)
@@ -105,8 +104,8 @@ def _warp(
     """Return images (B, C, h, w); see `warped`."""
     *texts, is_last = options
     antialias, padding, how = read(*texts)
-    every = range(target.size_for("Warp")[0])
-    found = partial(locate, source, target, rotation, tolerance, bool(antialias), every, padding)
-    inputs = [*source.tensors, *target.tensors, *([] if rotation is None else [rotation])]
-    where = _located(inputs, (source.form, target.form, tolerance, antialias, padding, rotation is None), found)
+    cameras, every = Between(source, target, rotation), range(target.size_for("Warp")[0])
+    found = partial(locate, cameras, every, tolerance, padding, bool(antialias))
+    form = source.form, target.form, tolerance, antialias, padding, rotation is None
+    where = _located(cameras.tensors, form, found)
     return (laid(render(images, where, how), is_last),)

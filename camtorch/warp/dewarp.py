@@ -98,7 +98,8 @@ class Dewarp(Warp):
                 height, width = size
                 most, of_plane = _PLANES.get(projection, (360, lambda angle: angle))
                 plane_width = of_plane(math.radians(as_fov(fov, "Dewarp", most, f" for {projection}")))
-                if (share := of_plane(_MIDDLE) / plane_width) < _LEAST_SHARE:
+                share = of_plane(_MIDDLE) / plane_width
+                if share < _LEAST_SHARE:
                     got = f"fov={fov:g} leaves {share * width:.0f} of {width} columns for the middle 60 degrees"
                     warn(f'Dewarp: {got}. Lower it, or choose projection="cylindrical" or "equirectangular"')
                 focal = camera.intrinsics.new_tensor(width / plane_width)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property, lru_cache, reduce
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import torch
@@ -14,11 +14,13 @@ from torch.autograd import Function
 from camtorch.evaluate.devices import sent
 from camtorch.evaluate.door import is_cheap_to_read, is_eager
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.tensors import known_true
+from camtorch.evaluate.tensors import are_plain, known_true
 from camtorch.native import sampler
 from camtorch.native.library import native_available
-from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_QUINTIC, OUTSIDE, STEP
+from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_QUINTIC, FAR, OUTSIDE, STEP
 
+FEWEST_CELLS = 8  # along a side: with fewer, exact positions take less time than a lattice
+MOST_KEPT_NODES = 1 << 16  # of a lattice whose pixels are kept for the next one
 _BLOCK_PIXELS = 128  # that one product interpolates: wider ones multiply with more zeros
 _kept_weights = Kept(4)  # those of `_weights`
 
@@ -188,6 +190,55 @@ def _pixel_by_pixel(
         blocks[camera, :, i, :, j] = torch.where(known[:, None], exact, OUTSIDE)
         seen.unflatten(1, (n, STEP)).unflatten(3, (m, STEP))[camera, i, :, j] = known
     return planes[:, :, :height, :width].movedim(1, -1), seen[:, :height, :width]
+
+
+def to_positions(seen: Tensor, mapped: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return pixels (..., 2) of an image as positions for `grid_sample`; without a graph, `seen` is overwritten."""
+    if is_cheap_to_read(seen) and are_plain(seen):
+        for plane, side in zip(seen.unbind(-1), size[::-1], strict=True):
+            plane.mul_(2 / side).add_(1 / side - 1)
+        seen.clamp_(-FAR, FAR)
+        if not bool(mapped.all()):
+            seen.masked_fill_(~mapped.unsqueeze(-1), OUTSIDE)
+        return seen
+    planes = [
+        (plane * (2 / side) + (1 / side - 1)).clamp(-FAR, FAR)
+        for plane, side in zip(seen.unbind(-1), size[::-1], strict=True)
+    ]
+    return torch.where(mapped, torch.stack(planes), OUTSIDE).movedim(0, -1)
+
+
+def coarse(size: tuple[int, ...]) -> tuple[int, int]:
+    """Return the first pixel and the step, in both directions, at which a target (h, w) shows how far images shrink."""
+    if min(size) >= 64:
+        return 16, 32
+    return 0, STEP if min(size) > STEP else 1
+
+
+def probes(first: int, size: tuple[int, int], dtype: torch.dtype, more: int = 5) -> Tensor:
+    """Return the nodes of a lattice, and then the pixels at the rim of the target, (1, N, 2) on the CPU.
+
+    Along an axis there are as many nodes as cells, and `more`. Of small lattices they are kept for the next one.
+    """
+    nodes = (math.ceil(size[0] / STEP) + more) * (math.ceil(size[1] / STEP) + more)
+    return (_kept_probes if nodes <= MOST_KEPT_NODES else _new_probes)(first, size, dtype, more)
+
+
+def _new_probes(first: int, size: tuple[int, int], dtype: torch.dtype, more: int) -> Tensor:
+    with torch.inference_mode(False):
+        down, across = (torch.arange(length, dtype=dtype, device="cpu") for length in size)
+        # two more nodes on each side of the cells: one for the cubics, and both for fourth differences
+        counts = [math.ceil(side / STEP) + more for side in size]
+        v, u = ((torch.arange(count, dtype=dtype, device="cpu") - more // 2) * STEP for count in counts)
+        nodes = torch.stack(torch.meshgrid(u, v + first, indexing="xy"))
+        # (2 (w + h), 2): the pixels of the first and the last row, and of the first and the last column
+        down += first
+        sides = [(across, torch.full_like(across, end)) for end in (first, first + size[0] - 1)]
+        sides += [(torch.full_like(down, end), down) for end in (0, size[1] - 1)]
+        return torch.cat((nodes.flatten(1), torch.cat([torch.stack(pair, -1) for pair in sides]).mT), 1).mT[None]
+
+
+_kept_probes = lru_cache(maxsize=8)(_new_probes)
 
 
 def straight_lattice(matrix: Tensor, rows: range, width: int, dtype: torch.dtype) -> Lattice:

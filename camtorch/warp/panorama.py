@@ -37,6 +37,14 @@ class Seam(NamedTuple):
         images = torch.cat(rows, -2) if len(rows) > 1 else images
         return torch.cat((images[..., -left:], images, images[..., :right]), -1)
 
+    def camera_of(self, camera: Camera) -> Camera:
+        """Return the camera of the extended images of a camera."""
+        left, right, top, bottom = self.rims
+        height, width = camera.size_for("Warp")
+        intrinsics = camera.intrinsics + camera.intrinsics.new_tensor([0.0, 0.0, left, top])
+        size = height + top + bottom, width + left + right
+        return remade(camera, intrinsics=intrinsics, distortion=camera.distortion, image_size=size)
+
     def on_image(self, grid: Tensor, size: tuple[int, int]) -> Tensor:
         """Return positions (..., 2) on the extended images as positions on the images of a size."""
         (height, width), (left, right, top, bottom) = size, self.rims
@@ -44,20 +52,10 @@ class Seam(NamedTuple):
         return grid * scale + grid.new_tensor([(right - left) / width, (bottom - top) / height])
 
 
-def with_seam(camera: Camera, seam: Seam | None) -> Camera:
-    """Return the camera of images that a seam extends, or the same one without a seam."""
-    if seam is None:
-        return camera
-    left, right, top, bottom = seam.rims
-    height, width = camera.size_for("Warp")
-    intrinsics = camera.intrinsics + camera.intrinsics.new_tensor([0.0, 0.0, left, top])
-    size = height + top + bottom, width + left + right
-    return remade(camera, intrinsics=intrinsics, distortion=camera.distortion, image_size=size)
-
-
 def seam_of(camera: Camera) -> Seam | None:
     """Return how far a camera's whole-turn images are extended, or None; in traced code, the last result."""
-    if (axis := camera.turn_axis) is None:
+    axis = camera.turn_axis
+    if axis is None:
         return None
     numbers = values_of(camera.intrinsics)
     if numbers is not None:
@@ -88,18 +86,24 @@ def _found(camera: Camera, axis: int, numbers: Tensor) -> Seam | None:
 
 def goes_round(camera: Camera) -> tuple[int, Tensor] | None:
     """Return the axis and the numbers (C, 4) of a panorama whose images show a whole turn or more; None for others."""
-    if (axis := camera.turn_axis) is None or (numbers := values_of(camera.intrinsics)) is None:
+    axis = camera.turn_axis
+    if axis is None:
         return None
-    numbers, side = numbers.reshape(-1, 4), camera.size_for("Warp")[1 - axis]
+    known = values_of(camera.intrinsics)
+    if known is None:
+        return None
+    numbers, side = known.reshape(-1, 4), camera.size_for("Warp")[1 - axis]
     return (axis, numbers) if bool((math.tau * numbers[:, axis] < side + _MOST_GAP).all()) else None
 
 
 def lengths(camera: Camera, steps: tuple[Tensor, Tensor], grid: tuple[Tensor, Tensor]) -> Tensor:
     """Return the lengths (B, h, w) of steps on a camera's image in pixels; on a panorama, as in the scene."""
-    if (turn := goes_round(camera)) is None:
+    turn = goes_round(camera)
+    if turn is None:
         return torch.hypot(*steps)
-    axis, numbers = turn[0], turn[1][..., None, None].to(grid[0])
-    period, other = math.tau * numbers[:, axis], 1 - axis
+    axis, other = turn[0], 1 - turn[0]
+    numbers = turn[1][..., None, None].to(grid[0])
+    period = math.tau * numbers[:, axis]
     along = steps[axis] - period * (steps[axis] / period).round()
     if camera.has_poles:
         place = ((grid[other] + 1) * camera.size_for("Warp")[1 - other] - 1) / 2
@@ -109,7 +113,8 @@ def lengths(camera: Camera, steps: tuple[Tensor, Tensor], grid: tuple[Tensor, Te
 
 def off_poles(camera: Camera, rays: Tensor) -> Tensor:
     """Return rays (..., 3) moved off the poles of a sphere, where its image has a row of pixels and its model none."""
-    if (axis := camera.turn_axis) is None or not camera.has_poles:
+    axis = camera.turn_axis
+    if axis is None or not camera.has_poles:
         return rays
     planes = list(rays.unbind(-1))
     least = planes[1 - axis].abs() * torch.finfo(rays.dtype).eps
@@ -120,13 +125,16 @@ def off_poles(camera: Camera, rays: Tensor) -> Tensor:
 
 def within_turn(camera: Camera, pixels: Tensor) -> Tensor:
     """Return pixels ([B,] h, w, 2); those of a whole turn are wrapped to pixels for which the model has rays."""
-    if (seam := seam_of(camera)) is None:
+    seam = seam_of(camera)
+    if seam is None:
         return pixels
     axis, side = seam.axis, camera.size_for("Warp")[1 - seam.axis]
-    numbers, planes = camera.intrinsics.detach(), list(pixels.unbind(-1))
+    numbers = camera.intrinsics.detach()
     numbers = numbers.reshape(*numbers.shape[:-1], *[1] * (pixels.ndim - numbers.ndim), 4)
-    offset = planes[axis] - numbers[..., 2 + axis]
+    focal, centre = numbers[..., axis], numbers[..., 2 + axis]
+    planes = list(pixels.unbind(-1))
+    offset = planes[axis] - centre
     offset = offset - (offset / side).round() * side
-    end = math.pi * (1 - 8 * torch.finfo(numbers.dtype).eps) * numbers[..., axis]  # pi itself is rounded beyond the end
-    planes[axis] = numbers[..., 2 + axis] + torch.maximum(torch.minimum(offset, end), -end)
+    end = math.pi * (1 - 8 * torch.finfo(numbers.dtype).eps) * focal  # pi itself is rounded beyond the end
+    planes[axis] = centre + torch.maximum(torch.minimum(offset, end), -end)
     return torch.stack(torch.broadcast_tensors(*planes), -1)

@@ -14,9 +14,8 @@ from camtorch.evaluate.tensors import as_own, known_false, values_of
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, turn
 from camtorch.values.arguments import Numbers, as_batch, as_coordinates, as_number, as_real, shown
-from camtorch.warp.grid import pixels_of_rows, scaled_rows, to_positions
-from camtorch.warp.lattice import PixelPositions
-from camtorch.warp.moving import placed
+from camtorch.warp.grid import pixels_of_rows, placed, scaled_rows
+from camtorch.warp.lattice import PixelPositions, to_positions
 from camtorch.warp.options import PaddingMode, WarpOptions
 from camtorch.warp.panorama import off_poles
 from camtorch.warp.reproject import beside, check_pose
@@ -79,10 +78,9 @@ class PlaneWarp(Warp):
 
     def _check(self, owner: str) -> None:
         """Raise a ValueError if the plane goes through a camera, or between them."""
-        known = [values for t in (*self._pose(), self.normal, self.distance) if (values := values_of(t)) is not None]
-        if len(known) < 4:
+        rotation, shift, normal, distance = map(values_of, (*self._pose(), self.normal, self.distance))
+        if rotation is None or shift is None or normal is None or distance is None:
             return
-        rotation, shift, normal, distance = known
         place = -(rotation.mT @ shift[..., None])[..., 0]
         if not bool((torch.linalg.vector_norm(normal, dim=-1) > 0).all() & (distance != 0).all()):
             raise ValueError(
@@ -120,7 +118,7 @@ class PlaneWarp(Warp):
     def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> PixelPositions:
         if not self.antialias:
             return PixelPositions(*self._of_rows(rows), None)
-        return scaled_rows(self.sampled, rows, self.image_size[0], self._of_rows)
+        return scaled_rows(self.sampled.source, rows, self.image_size[0], self._of_rows)
 
     def _of_rows(self, rows: range) -> tuple[Tensor, Tensor]:
         pixels = pixels_of_rows(self.target, rows)
@@ -128,7 +126,7 @@ class PlaneWarp(Warp):
         seen, mapped = self.move(pixels.expand(*batch, *pixels.shape), back=True)
         if self.seam is not None:
             seen = seen + seen.new_tensor(self.seam.rims[::2])
-        return to_positions(seen, mapped, self.sampled.size_for("Warp")), mapped
+        return to_positions(seen, mapped, self.sampled.source.size_for("Warp")), mapped
 
     def move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
         source, target = (self.target, self.source) if back else (self.source, self.target)

@@ -16,8 +16,7 @@ from camtorch.rays.depth import as_depth, depth_scale
 from camtorch.values.arguments import Numbers, as_batch, check_devices, shown
 from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import GeometryModule, typed_as
-from camtorch.warp.grid import to_positions
-from camtorch.warp.lattice import PixelPositions
+from camtorch.warp.lattice import PixelPositions, to_positions
 from camtorch.warp.options import Fill, Mode, PaddingMode, Sampler, as_options
 from camtorch.warp.panorama import off_poles, seam_of
 from camtorch.warp.sampling import render
@@ -112,7 +111,8 @@ class Reproject(GeometryModule):
         # an image that is shifted by whole pixels, or not at all, is copied to the bit
         plain = steps == 1 and are_plain(seen) and known_true((seen == seen.round()).all(-1) | ~valid)
         mode: Mode = "nearest" if plain else self.mode
-        if (seam := seam_of(self.source)) is not None:  # the image goes on beyond its edges
+        seam = seam_of(self.source)
+        if seam is not None:  # the image goes on beyond its edges
             images, seen = seam.around(images), seen + seen.new_tensor(seam.rims[::2])
         positions = to_positions(seen.flatten(1, 2), valid.flatten(1, 2), (images.shape[-2], images.shape[-1]))
         valid = valid & (positions.detach().abs() <= 1).all(-1).view(valid.shape)

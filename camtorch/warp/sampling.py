@@ -27,17 +27,15 @@ _TILE_SIDE = 512  # pixels of what is then sampled at a time
 _TRACED_LEVELS = 4  # if the values that decide cannot be read: down to a sixteenth
 
 
-def render(
-    images: Tensor, where: Positions, how: Sampler, kept: dict[int, Pyramid] | None = None, out: Tensor | None = None
-) -> Tensor:
+def render(images: Tensor, where: Positions, how: Sampler, pyramids: dict[int, Pyramid] | None = None) -> Tensor:
     """Return the images (B, C, h, W') that a warp makes of (B or 1, C, H, W), in their dtype.
 
     Half precision is sampled in float32; integers are rounded and stay in their range, bool is true from one half on.
-    Images that are computed in another dtype are copied in parts. `kept` holds halves of the images for the next call,
-    and `out` takes a result without a graph.
+    Images that are computed in another dtype are copied in parts. `pyramids` holds halves of the images for the next
+    call.
     """
-    call = prepared(images, where, how, out)
-    return by_torch(images, where, how, kept, out) if call is None else call(images, out)
+    call = prepared(images, where, how)
+    return by_torch(images, where, how, pyramids) if call is None else call(images)
 
 
 def laid_as(images: Tensor, result: Tensor) -> Tensor:
@@ -47,8 +45,8 @@ def laid_as(images: Tensor, result: Tensor) -> Tensor:
     return result.contiguous(memory_format=torch.channels_last)
 
 
-def prepared(images: Tensor, where: Positions, how: Sampler, out: Tensor | None = None) -> sampler.Call | None:
-    """Return the call of native code for images (B or 1, C, H, W) of this form, of which results lie like `out`.
+def prepared(images: Tensor, where: Positions, how: Sampler) -> sampler.Call | None:
+    """Return the call of native code for images (B or 1, C, H, W) of this form.
 
     None with a graph, a transform, another device or dtype, or antialiasing.
     """
@@ -58,12 +56,10 @@ def prepared(images: Tensor, where: Positions, how: Sampler, out: Tensor | None 
         return None
     fill = fill * images.shape[1] if len(fill) == 1 else fill
     images = images if len(like) == 1 else images.expand(len(like), -1, -1, -1)
-    return sampler.Call(images, where.size, mode, padding_mode, fill, **where.for_native(padding_mode), out=out)
+    return sampler.Call(images, where.size, mode, padding_mode, fill, **where.for_native(padding_mode))
 
 
-def by_torch(
-    images: Tensor, where: Positions, how: Sampler, kept: dict[int, Pyramid] | None = None, out: Tensor | None = None
-) -> Tensor:
+def by_torch(images: Tensor, where: Positions, how: Sampler, pyramids: dict[int, Pyramid] | None = None) -> Tensor:
     """Sample images (B or 1, C, H, W) by `grid_sample`; see `render`."""
     where = where.pixels
     cameras = where.grid.shape[0]
@@ -72,28 +68,27 @@ def by_torch(
         where = where._replace(scale=None)
     if not images.dtype.is_floating_point:
         where = where._replace(grid=where.grid.detach())
-    result = _within_memory(images, where, how, kept)
-    return laid_as(images, result) if out is None else out.copy_(result)
+    return laid_as(images, _within_memory(images, where, how, {} if pyramids is None else pyramids))
 
 
-def _within_memory(images: Tensor, where: PixelPositions, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
+def _within_memory(images: Tensor, where: PixelPositions, how: Sampler, pyramids: dict[int, Pyramid]) -> Tensor:
     """Return the samples of images, in parts where those are copied in another dtype."""
     count, dtype = images.shape[0], images.dtype
     if how.mode == "nearest" and not dtype.is_floating_point and dtype.itemsize > 2:
         return _nearest_integers(images, where, how)
     where = where._replace(grid=converted(where.grid, wide_dtype(dtype)))
     if dtype == wide_dtype(dtype) or not (is_eager(images, where.grid) and are_plain(images, where.grid)):
-        levels = _levels(kept, 0, widen(images))
+        levels = pyramids.setdefault(0, Pyramid(widen(images)))
         return narrow(_one_piece(levels.images, where.grid, where, levels, how), dtype)
     large = math.prod(images.shape[1:]) > _CACHED_NUMBERS
-    # the step must not change between strips of the target: `kept` has the pyramids of parts by their first image
+    # the step must not change between strips of the target: `pyramids` are those of parts by their first image
     step = 1 if large else thread_count()
     if count <= step and not large:
-        return _by_strips(images, where, how, kept)
+        return _by_strips(images, where, how, pyramids)
     result = images.new_empty(*images.shape[:2], *where.size)
     for i in range(0, count, step):
         part = slice(i, i + step)
-        levels = _levels(kept, i, images[part])
+        levels = pyramids.setdefault(i, Pyramid(images[part]))
         here = where if where.grid.shape[0] == 1 else where.cameras(part)
         if large:
             _render_tiles(result[part], levels, here, how)
@@ -102,11 +97,12 @@ def _within_memory(images: Tensor, where: PixelPositions, how: Sampler, kept: di
     return result
 
 
-def _by_strips(images: Tensor, where: PixelPositions, how: Sampler, kept: dict[int, Pyramid] | None) -> Tensor:
+def _by_strips(images: Tensor, where: PixelPositions, how: Sampler, pyramids: dict[int, Pyramid]) -> Tensor:
     """Render images strip by strip, whose memory is used again: new memory takes as long as sampling."""
     height, width = where.size
     copy = memory.empty(tuple(images.shape), wide_dtype(images.dtype), sampler.layout(images))
-    levels, result = _levels(kept, 0, copy.copy_(images)), sampler.maker(images, len(images), where.size)()
+    levels = pyramids.setdefault(0, Pyramid(copy.copy_(images)))
+    result = sampler.maker(images, len(images), where.size)()
     rows = max(_STRIP_NUMBERS // max(math.prod(images.shape[:2]) * width, 1), 1)
     for top in range(0, height, rows):
         here = where.part(slice(top, top + rows))
@@ -131,11 +127,6 @@ def _nearest_integers(images: Tensor, where: PixelPositions, how: Sampler) -> Te
     pixels = images.view(SIGNED.get(images.dtype, images.dtype)).flatten(2)
     picked = pixels.gather(2, index.expand(*images.shape[:2], -1)).view(images.dtype)
     return torch.where(seen.unsqueeze(1), picked.unflatten(2, where.grid.shape[1:3]), value)
-
-
-def _levels(kept: dict[int, Pyramid] | None, i: int, images: Tensor) -> Pyramid:
-    """Return the pyramid of the images from the i-th on: the `kept` one, with the halves that it has, or a new one."""
-    return Pyramid(images) if kept is None else kept.setdefault(i, Pyramid(images))
 
 
 def _render_tiles(result: Tensor, levels: Pyramid, where: PixelPositions, how: Sampler) -> None:

@@ -11,9 +11,8 @@ from torch.nn.functional import max_pool2d
 
 from camtorch.cameras.camera import Camera
 from camtorch.rays.depth import depth_scale
-from camtorch.warp.grid import to_positions
-from camtorch.warp.lattice import PixelPositions
-from camtorch.warp.moving import placed
+from camtorch.warp.grid import placed
+from camtorch.warp.lattice import PixelPositions, to_positions
 from camtorch.warp.options import PaddingMode
 from camtorch.warp.warp import Warp
 

@@ -25,6 +25,7 @@ from camtorch.values.arguments import (
 )
 from camtorch.values.module import GeometryModule
 from camtorch.warp.affine import UncheckedWarp
+from camtorch.warp.grid import Between
 from camtorch.warp.options import TolerantOptions
 from camtorch.warp.warp import Warp
 
@@ -202,10 +203,9 @@ class ShutterWarp(UncheckedWarp):
         self.turned_by(rotation)
 
     @property
-    def _ends(self) -> tuple[Camera, Camera]:
-        pairs = (self.shutter, self.source), (self.target_shutter, self.target)
-        source, target = (camera if each is None else cast("Camera", InMotion(camera, each)) for each, camera in pairs)
-        return source, target
+    def ends(self) -> Between:
+        source, target = _in_motion(self.source, self.shutter), _in_motion(self.target, self.target_shutter)
+        return Between(source, target, self.rotation)
 
     def inverse(self) -> Warp:
         """Return the warp from target to source. It applies the shutter that this one undoes, and undoes the other."""
@@ -219,6 +219,11 @@ class ShutterWarp(UncheckedWarp):
     def own_parts(self, index: list[int] | None = None) -> dict[str, Any]:
         both = {"shutter": self.shutter, "target_shutter": self.target_shutter}
         return {name: each if each is None or index is None else each.rows_of(index) for name, each in both.items()}
+
+
+def _in_motion(camera: Camera, shutter: RollingShutter | None) -> Camera:
+    """Return the camera behind its shutter, if it has one."""
+    return camera if shutter is None else cast("Camera", InMotion(camera, shutter))
 
 
 class InMotion:

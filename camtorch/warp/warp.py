@@ -1,6 +1,6 @@
 """The `Warp`: images and labels from one camera to another.
 
-Other kinds of warps are subclasses, but for `Reproject`: where it samples follows from a depth, which comes with images.
+Other kinds of warps are subclasses, but for `Reproject`, which samples by a depth that comes with the images.
 """
 
 from __future__ import annotations
@@ -214,7 +214,8 @@ class Warp(CameraPair):
         rows = None if rows is None else as_whole(rows, "rows", "Warp", least=1)
         if isinstance(images, Tensor) and images.ndim != 4:
             raise ValueError(f"Warp: images must be (B, C, H, W) for strips; got shape {tuple(images.shape)}")
-        return self.in_strips(images, rows, checked(self, images, mode, padding_mode, fill))
+        strips = self.in_strips(images, checked(self, images, mode, padding_mode, fill), rows)
+        return ((rows, part, self.on_image(where)) for rows, part, where in strips)
 
     def grid(self) -> Tensor:
         """Return positions (B or 1, H', W', 2) for `grid_sample(..., align_corners=False)`; -9 for none."""

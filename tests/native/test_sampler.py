@@ -17,8 +17,8 @@ import camtorch as ct
 from camtorch.native import build as building
 from camtorch.native import sampler
 from camtorch.native.library import _find, library, native_available
+from camtorch.native.structs import OUTSIDE
 from camtorch.values.dtypes import widen
-from camtorch.warp import grid as positions
 from camtorch.warp import grid_sample, sampling
 from camtorch.warp.lattice import Lattice, PixelPositions
 from camtorch.warp.options import MODES, PADDINGS, Sampler
@@ -172,7 +172,7 @@ def test_every_image_is_sampled_as_torch_does(dtype, mode, padding):
     count, source, target = 2, (23, 37), (13, 30)
     where = PixelPositions(spots(count, target, source), torch.rand(count, *target, generator=generator(9)) < 0.9, None)
     if padding == "zeros":
-        where.grid[~where.mapped] = positions.OUTSIDE
+        where.grid[~where.mapped] = OUTSIDE
     for i, (name, layout) in enumerate(LAYOUTS.items()):
         channels = (1, 3, 4, 2, 5, 7)[i % 6] if "last" not in name else (3, 4)[i % 2]
         images = pixels(dtype, (count, channels, *source), i)

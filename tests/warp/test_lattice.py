@@ -27,8 +27,8 @@ def way(request, monkeypatch):
     if request.param == "compiled" and not native_available():
         pytest.skip("there is no compiled library")
     if request.param == "torch":
-        monkeypatch.setattr(grid, "native_available", lambda: False)
-        monkeypatch.setattr(grid.Between, "native", lambda _: None)
+        monkeypatch.setattr(cells, "native_available", lambda: False)
+        monkeypatch.setattr(grid.Between, "native_positions", lambda _: None)
 
 
 def check(source, target, rotation):
@@ -80,8 +80,10 @@ def test_torch_doubts_the_cells_that_compiled_code_doubts(key, monkeypatch):
     target, rotation = ct.Dewarp(camera).target, turn(20.0, -10.0, 30.0)
     compared = []
 
+    by_torch = cells.classify
+
     def both(*given):
-        found = cells.classify(*given)
+        found = by_torch(*given)
         assert torch.equal(found, sampler.classify(*given))
         compared.append(found)
         return found
@@ -91,10 +93,10 @@ def test_torch_doubts_the_cells_that_compiled_code_doubts(key, monkeypatch):
             given = grid.Between(*pair, rotation), range(240), tolerance, padding
             compiled = grid.on_lattice(*given)
             with monkeypatch.context() as patch:
-                patch.setattr(grid, "native_available", lambda: False)
-                patch.setattr(grid.Between, "native", lambda _: None)
-                patch.setattr(grid, "classify", both)
-                patch.setattr(grid, "are_smooth", lambda *_: False)
+                patch.setattr(cells, "native_available", lambda: False)
+                patch.setattr(grid.Between, "native_positions", lambda _: None)
+                patch.setattr(cells, "classify", both)
+                patch.setattr(cells, "are_smooth", lambda *_: False)
                 laid = grid.on_lattice(*given)
             if compiled is not None and laid is not None:
                 assert torch.equal(compiled.pixels.mapped, laid.pixels.mapped)
