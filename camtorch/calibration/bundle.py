@@ -15,12 +15,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.calibration import native_calls as compiled_poses
+from camtorch.calibration.native_calls import Errors, PoseSearch, project_views, refine_poses, turned_by
 from camtorch.calibration.observations import Observations
+from camtorch.calibration.robust import LEAST_SQUARES, Loss
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import fixed_camera
 from camtorch.convert.fitting import bounds
-from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
+from camtorch.least_squares.equations import Equations, System, padded, places_of, triangle_of_few
 from camtorch.least_squares.jacobians import sensor_jacobians
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, rounding_of
 from camtorch.native.structs import LOST
@@ -30,9 +31,8 @@ from camtorch.projection.evaluation import native_forms
 from camtorch.projection.rows import CameraRows
 from camtorch.values.module import remade
 
-LOSSES = ("huber", "cauchy")
-SETTLED = 1e-10  # the squared distance to the optimum, over the variance, at which a search ends
-_NOTHING = 1e-11  # px, which counts as no error
+SETTLED = 1e-10  # see `adjust`
+_NOTHING = 1e-11  # px
 
 
 class Poses(NamedTuple):
@@ -107,6 +107,11 @@ class State(NamedTuple):
         parameters = tuple(p[rows] for p in self.parameters)
         return State(parameters, self.mounts.of(rows), self.boards.of(rows), self.bend[rows])
 
+    def boards_from(self, camera: int) -> Poses:
+        """Return the poses of the boards in the frame of a camera."""
+        rotations, translations = (t[:, camera, None] for t in self.mounts)
+        return Poses(rotations @ self.boards.rotations, self.boards.translations @ rotations[:, 0].mT + translations)
+
 
 class Free(NamedTuple):
     """The unknowns that learn."""
@@ -131,7 +136,7 @@ class Adjusted:
     @cached_property
     @torch.no_grad()
     def equations(self) -> Equations:
-        return self.problem.equations(self.problem.flat(self.state))
+        return self.problem.equations(self.problem.flat(self.state), self.problem.every)
 
 
 @torch.no_grad()
@@ -140,22 +145,33 @@ def adjust(
     state: State,
     free: Free,
     *,
-    loss: str | None = None,
-    loss_scale: float = 1.0,
+    loss: Loss = LEAST_SQUARES,
     steps: int = 60,
     settled: float = SETTLED,
+    nothing: float = _NOTHING,
+    damping: float = FIRST_DAMPING,
+    going: Tensor | None = None,
 ) -> Adjusted:
     """Return the state of least squares near a given one, for each of B problems, whose cameras see the same views.
 
     A seen point without a pixel counts as far away, so no step loses points. During the search a lens may reach beyond
-    its end, see `Camera.model_for_search`; points that lie there at the end are not valid. loss: see `robust`, in px.
+    its end, see `Camera.model_for_search`; points that lie there at the end are not valid.
+
+    A search ends at the squared distance `settled` to the optimum, over the variance, or if the errors are at most
+    `nothing` px; `damping` is the first one. `going`, bool (B,), selects the problems to search, all by default.
     """
-    problem = Bundle(observed, state, free, loss, loss_scale)
+    problem = Bundle(observed, state, free, loss)
     counts = torch.stack([(s.weights > 0).sum((-1, -2)) for s in problem.observed]).sum(0)
-    tolerance, tiny = settled / (2 * counts - problem.unknowns).clamp(min=1), _NOTHING**2 * counts
-    flat = problem.flat(state)
-    found = minimise(problem, flat, tolerance=tolerance, tiny=tiny, steps=steps)
-    by_camera = problem.all_errors(found.state, torch.arange(len(found.cost), device=found.cost.device))
+    found = minimise(
+        problem,
+        problem.flat(state),
+        tolerance=settled / (2 * counts - problem.unknowns).clamp(min=1),
+        tiny=nothing**2 * counts,
+        going=going,
+        steps=steps,
+        damping=damping,
+    )
+    by_camera = problem.all_errors(found.state, problem.every)
     return Adjusted(
         problem.state(found.state),
         found.cost,
@@ -167,18 +183,18 @@ def adjust(
 
 
 def minima(
-    model: type[Camera], parameters: Tensor, poses: Poses, seen: Observations, loss: tuple[str, float], steps: int
+    model: type[Camera], parameters: Tensor, poses: Poses, seen: Observations, loss: Loss, steps: int
 ) -> tuple[Poses, Tensor]:
     """Return the poses (K, 1) of least cost near the given ones, each a problem of its own, and their costs (K,)."""
     points, pixels, weights = seen.points, seen.pixels, seen.seen.to(seen.pixels)
     camera = remade(_template(model, parameters), intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
     if (made := native_forms([camera], pixels)) is not None:
-        search = compiled_poses.Search(steps, SETTLED, _NOTHING, FIRST_DAMPING, *loss)
+        search = PoseSearch(steps, SETTLED, _NOTHING, FIRST_DAMPING, loss)
         start = poses.rotations[:, 0], poses.translations[:, 0]
-        rotations, translations, cost = compiled_poses.refine_poses(made[0][0], points, pixels, weights, start, search)
+        rotations, translations, cost = refine_poses(made[0][0], points, pixels, weights, start, search)
         return Poses(rotations[:, None], translations[:, None]), cost
     observed = CameraObservations(model, points[:, None], pixels[:, None], weights[:, None])
-    found = adjust_poses(observed, parameters, poses, loss=loss[0], loss_scale=loss[1], steps=steps)
+    found = adjust_poses(observed, parameters, poses, loss=loss, steps=steps)
     return found.state.boards, found.cost
 
 
@@ -186,20 +202,6 @@ def adjust_poses(observed: CameraObservations, parameters: Tensor, poses: Poses,
     """Return the poses (K, 1) of least cost near the given ones, each a problem of its own, for a fixed camera."""
     free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
     return adjust([observed], State.of_one(parameters, poses), free, **options)
-
-
-def robust(loss: str | None, scale: float, squares: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the costs of residuals by their squared lengths, and the derivatives: the weights of the squares.
-
-    huber: s if s <= c^2, else 2 c sqrt(s) - c^2. cauchy: c^2 log(1 + s / c^2).
-    """
-    c2 = scale * scale
-    if loss == "huber":
-        length = squares.clamp(min=c2).sqrt()
-        return torch.where(squares <= c2, squares, 2 * scale * length - c2), scale / length
-    if loss == "cauchy":
-        return c2 * torch.log1p(squares / c2), 1 / (1 + squares / c2)
-    return squares, torch.ones_like(squares)
 
 
 def bend_points(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
@@ -219,12 +221,11 @@ def bend_points(points: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
 class Bundle:
     """The problem for `levenberg_marquardt.minimise`, whose state is a flat tuple of tensors (B, ...)."""
 
-    def __init__(
-        self, observed: Sequence[CameraObservations], state: State, free: Free, loss: str | None, loss_scale: float
-    ):
-        self.free, self.loss, self.loss_scale = free, loss, loss_scale
-        self._last: tuple[tuple[Tensor, ...], list[compiled_poses.Errors]] | None = None
+    def __init__(self, observed: Sequence[CameraObservations], state: State, free: Free, loss: Loss = LEAST_SQUARES):
+        self.free, self.loss = free, loss
+        self._last: tuple[tuple[Tensor, ...], list[Errors]] | None = None
         batch = state.boards.translations.shape[0]
+        self.every = torch.arange(batch, device=state.boards.translations.device)
         self.observed = [s.mapped(lambda t: t.expand(batch, *t.shape[1:])) for s in observed]
         self.cameras = [_template(s.model, p) for s, p in zip(observed, state.parameters, strict=True)]
         self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.observed]).sum(0)
@@ -240,12 +241,10 @@ class Bundle:
             + [(c, len(free.parameters[c]) + i) for c, learns in enumerate(free.mounts) if learns for i in range(6)]
             + [(-1, i) for i in range(2) if free.bend]
         )
-        # for each camera, the indices of its columns and of the parameters in them
-        self.learnt: list[tuple[Tensor, Tensor]] = []
-        for c, p in enumerate(state.parameters):
-            of = [(g, i) for g, (camera, i) in enumerate(self.columns) if camera == c and i < p.shape[-1]]
-            at, own = torch.tensor(of, dtype=torch.long, device=p.device).view(-1, 2).unbind(-1)
-            self.learnt.append((at, own))
+        # for each camera, the places of its parameters among the columns, and their indices; the places of its mount
+        counts = [p.shape[-1] for p in state.parameters]
+        self.learnt = [places_of(self.columns, c, range(count)) for c, count in enumerate(counts)]
+        self.mounted = [places_of(self.columns, c, range(count, count + 6))[0] for c, count in enumerate(counts)]
         self.is_bent = free.bend or bool((state.bend != 0).any())
         # native code knows one camera that sees flat boards at unknown poses
         plain = len(observed) == 1 and free.boards == "poses" and not (free.mounts[0] or self.is_bent)
@@ -270,9 +269,8 @@ class Bundle:
     def _of_columns(self, parameters: Sequence[Tensor], other: float) -> Tensor:
         """Return the value of each shared unknown (B, G) in `parameters`, or `other` for mounts and bends."""
         found = parameters[0].new_full((max(map(len, parameters)), len(self.columns)), other)
-        for g, (c, i) in enumerate(self.columns):
-            if c >= 0 and i < parameters[c].shape[-1]:
-                found[:, g] = parameters[c][:, i]
+        for (places, own), values in zip(self.learnt, parameters, strict=True):
+            found[:, places] = values[:, own]
         return found
 
     def points(self, c: int, state: State, observed: CameraObservations) -> tuple[Tensor, Tensor, Tensor]:
@@ -289,34 +287,34 @@ class Bundle:
         parameters = state.parameters[c]
         return self.fixed[c] or remade(self.cameras[c], intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
 
-    def errors_of(self, c: int, flat: Sequence[Tensor], rows: Tensor | None = None) -> compiled_poses.Errors:
+    def errors_of(self, c: int, flat: Sequence[Tensor], rows: Tensor) -> Errors:
         """Return residuals, validity, weights and costs of a camera at a state."""
         state, observed = self.state(flat), self.observed_by(c, rows)
         if self.is_plain and len(state.bend):
             parameters = state.parameters[0][: 1 if self.are_shared[0] else None]
             native = CameraRows(type(self.cameras[0]), parameters[:, :4], parameters[:, 4:]).native
             assert native is not None  # the first cameras had it
-            own = self.learnt[0][1].tolist()
+            own = self.learnt[0][1]
             has_triangles = native.plan.places is not None or all(i < 4 for i in own)
-            given = observed.points, state.boards, observed.pixels, observed.weights, (self.loss, self.loss_scale)
+            given = observed.points, state.boards, observed.pixels, observed.weights, self.loss
             # triangles for the next step, which begins here unless this one is rejected
-            return compiled_poses.project_views(native, *given, own if has_triangles else None)
+            return project_views(native, *given, own if has_triangles else None)
         pixels, valid = self.camera(c, state).project(self.points(c, state, observed)[-1])
         residuals = torch.where((valid & (observed.weights > 0))[..., None], pixels - observed.pixels, 0.0)
         u, v = residuals.unbind(-1)
-        cost, slope = robust(self.loss, self.loss_scale, u * u + v * v)
-        lost, _ = robust(self.loss, self.loss_scale, cost.new_tensor(LOST**2))
+        cost, slope = self.loss.of(u * u + v * v)
+        lost, _ = self.loss.of(cost.new_tensor(LOST**2))
         cost = (torch.where(valid, cost, lost) * observed.weights).sum(-1)
-        return compiled_poses.Errors(residuals, valid, torch.where(valid, slope * observed.weights, 0.0), cost)
+        return Errors(residuals, valid, torch.where(valid, slope * observed.weights, 0.0), cost)
 
-    def all_errors(self, flat: Sequence[Tensor], rows: Tensor) -> list[compiled_poses.Errors]:
+    def all_errors(self, flat: Sequence[Tensor], rows: Tensor) -> list[Errors]:
         """Return the errors of all cameras; the last ones are reused if the state is the same."""
         given, last = (rows, *flat), self._last
         if last is None or not all(a is b or torch.equal(a, b) for a, b in zip(given, last[0], strict=True)):
             self._last = last = given, [self.errors_of(c, flat, rows) for c in range(len(self.observed))]
         return last[1]
 
-    def shown(self, c: int, flat: Sequence[Tensor], errors: compiled_poses.Errors) -> Tensor:
+    def shown(self, c: int, flat: Sequence[Tensor], errors: Errors) -> Tensor:
         """Whether a camera, of the model itself and not the one for the search, has pixels, (B, V, N) bool."""
         kind = self.observed[c].model
         if kind.model_for_search() is kind:
@@ -327,9 +325,9 @@ class Bundle:
         camera._expects_unusable = True
         return errors.valid & camera.project(self.points(c, state, self.observed[c])[-1])[1]
 
-    def observed_by(self, c: int, rows: Tensor | None) -> CameraObservations:
-        one = self.observed[c]
-        return one if rows is None or len(rows) == len(one.weights) else one.mapped(lambda t: t[rows])
+    def observed_by(self, c: int, rows: Tensor) -> CameraObservations:
+        """Return the observations of a camera for some of the problems."""
+        return self.observed[c].mapped(lambda t: _of_rows(t, rows))
 
     def cost(self, flat: Sequence[Tensor], rows: Tensor) -> Tensor:
         total = torch.cat([errors.cost for errors in self.all_errors(flat, rows)], -1).sum(-1)
@@ -349,8 +347,8 @@ class Bundle:
             held = (values <= low) & (slope > 0) | (values >= high) & (slope < 0)
         return System(equations, self.width, held)
 
-    def equations(self, flat: Sequence[Tensor], rows: Tensor | None = None) -> Equations:
-        rows = torch.arange(len(flat[0]), device=flat[0].device) if rows is None else rows
+    def equations(self, flat: Sequence[Tensor], rows: Tensor) -> Equations:
+        """Return the linearised problem."""
         state, width, total = self.state(flat), self.width, len(self.columns)
         by_camera, parts = self.all_errors(flat, rows), []
         if (made := by_camera[0].triangles) is not None:
@@ -385,20 +383,19 @@ class Bundle:
             if one.prior:
                 centre, root = one.prior
                 rows = root.new_zeros(len(parameters), len(root), len(self.columns) + 1)
-                for g, (camera, i) in enumerate(self.columns):
-                    if camera == c and i < len(centre):
-                        rows[..., g] = root[:, i]
+                places, own = self.learnt[c]
+                rows[..., places] = root[:, own]
                 rows[..., -1] = (parameters - centre) @ root.mT
                 found.append(rows)
         return found
 
-    def rows_of(self, c: int, errors: compiled_poses.Errors, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
+    def rows_of(self, c: int, errors: Errors, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
         """Return rows (B, V, 2 N, L + F + 1) of a camera, and the indices of its F columns among shared unknowns."""
         observed = self.observed_by(c, rows)
         turned, first, points = self.points(c, state, observed)
         batch, views, count = points.shape[:3]
         lead = (1, batch * views * count) if self.are_shared[c] else (batch, views * count)
-        at, own = (t.tolist() for t in self.learnt[c])
+        places, own = self.learnt[c]
         found = pixel_jacobians(self.camera(c, state), points.reshape(*lead, 3), bool(own))
         by_point, by_parameters = (by.reshape(batch, views, count, 2, by.shape[-1]) for by in found)
         is_mounted = c > 0 or self.free.mounts[0]
@@ -409,17 +406,16 @@ class Bundle:
         columns.append(by_first)
         if own:
             columns.append(by_parameters[..., own])
-        count = state.parameters[c].shape[-1]
-        if mine := [g for g, (camera, i) in enumerate(self.columns) if camera == c and i >= count]:
-            at += mine
+        if self.free.mounts[c]:
             turned = first @ state.mounts.rotations[:, c, None].mT
             columns += [torch.linalg.cross(turned[..., None, :].expand_as(by_point), by_point, dim=-1), by_point]
-        if self.free.bend:
-            at += [g for g, (camera, _) in enumerate(self.columns) if camera == -1]
+        bend, _ = places_of(self.columns, -1, range(2))
+        if bend:
             along = by_first @ state.boards.rotations[:, :, None, :, 2:]
             columns.append(along * bend_points(observed.points, state.bend)[1][..., None, :])
         columns.append(errors.residuals[..., None])
-        return (torch.cat(columns, -1) * errors.weights.sqrt()[..., None, None]).flatten(2, 3), at
+        weighted = torch.cat(columns, -1) * errors.weights.sqrt()[..., None, None]
+        return weighted.flatten(2, 3), [*places, *self.mounted[c], *bend]
 
     def moved(self, flat: Sequence[Tensor], step: Sequence[Tensor], rows: Tensor) -> tuple[Tensor, ...]:
         """Return the state after steps of the views' unknowns (R, V, L) and the shared ones (R, G)."""
@@ -427,23 +423,23 @@ class Bundle:
         of_views, shared = step
         boards, mounts, bend = state.boards, state.mounts, state.bend
         if self.width == 6:
-            boards = Poses(compiled_poses.turn(boards.rotations, of_views), boards.translations + of_views[..., 3:])
+            boards = Poses(turned_by(boards.rotations, of_views), boards.translations + of_views[..., 3:])
         else:
             boards = boards._replace(translations=boards.translations + of_views)
         parameters = []
-        for p, (at, own) in zip(state.parameters, self.learnt, strict=True):
-            if len(at):
-                low, high = (_of_rows(ends, rows)[:, at] for ends in (self.low, self.high))
-                p = p.index_copy(1, own, (p[:, own] + shared[:, at]).clamp(low, high))
+        for p, (places, own) in zip(state.parameters, self.learnt, strict=True):
+            if own:
+                low, high = (_of_rows(ends, rows)[:, places] for ends in (self.low, self.high))
+                p = p.clone()
+                p[:, own] = (p[:, own] + shared[:, places]).clamp(low, high)
             parameters.append(p)
         if self.free.bend:
             bend = bend + shared[:, -2:]
         if any(self.free.mounts):
             turn, shift = torch.zeros_like(mounts.translations), torch.zeros_like(mounts.translations)
-            for g, (c, i) in enumerate(self.columns):
-                i -= parameters[c].shape[-1]
-                if c >= 0 and i >= 0:
-                    (turn if i < 3 else shift)[:, c, i % 3] += shared[:, g]
+            for c, places in enumerate(self.mounted):
+                if places:
+                    turn[:, c], shift[:, c] = shared[:, places[:3]], shared[:, places[3:]]
             mounts = Poses(small_turn(turn) @ mounts.rotations, mounts.translations + shift)
         return self.flat(State(tuple(parameters), mounts, boards, bend))
 

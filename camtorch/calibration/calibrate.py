@@ -6,23 +6,25 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch.calibration.bundle import LOSSES, Adjusted, CameraObservations, Free, Poses, Prior, State, adjust
-from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
+from camtorch.calibration.bundle import Adjusted, CameraObservations, Free, Poses, Prior, State, adjust
+from camtorch.calibration.observations import Observations, Points, as_observations, repeats
+from camtorch.calibration.robust import Loss, as_loss
 from camtorch.calibration.start import Lens, as_seen, other_cameras, other_poses, poses_for, start_from_nothing
-from camtorch.calibration.uncertainty import noise_under, shared_factor, spread
+from camtorch.calibration.uncertainty import shared_factor, spread
 from camtorch.calibration.verdict import Calibration, check_determined
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.camera import as_model as as_kind
 from camtorch.cameras.freezing import INTRINSICS, frozen_names
+from camtorch.least_squares.equations import places_of
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_vector
-from camtorch.values.arguments import as_flag, as_number, as_whole, hinting, no_camera, shown, warn
+from camtorch.values.arguments import as_flag, as_whole, hinting, no_camera, warn
 from camtorch.values.threads import on_one_thread
 
 STEPS = 300
@@ -96,15 +98,6 @@ def as_model(
     return Model(model, count, start, torch.tensor([name not in fixed for name in names], device="cpu"))
 
 
-def check_options(loss: str | None, loss_scale: float, bend: bool, owner: str) -> None:
-    """Raise if the loss, its scale or the flag is wrong."""
-    if loss is not None and not (isinstance(loss, str) and loss in LOSSES):
-        raise ValueError(f"{owner}: loss must be None or one of {LOSSES}; got {shown(loss)}")
-    if not 0 < as_number(loss_scale, "loss_scale", owner) < math.inf:
-        raise ValueError(f"{owner}: loss_scale must be positive pixels; got {loss_scale}")
-    as_flag(bend, "bend", owner)
-
-
 @on_one_thread
 @hinting('A model comes first: ct.calibrate("brown_conrady", object_points, image_points, image_size=(height, width))')
 def calibrate(
@@ -151,10 +144,9 @@ def calibrate(
         True
     """
     owner = "calibrate"
-    seen, layout = as_observations(object_points, image_points, image_size, owner)
-    check_options(loss, loss_scale, bend, owner)
-    asked = as_model(model, count, start, fixed, owner)
-    search = Search(owner, asked, seen, middle_of([seen]), layout, loss, loss_scale)
+    seen = as_observations(object_points, image_points, image_size, owner)
+    robust, bend = as_loss(loss, loss_scale, owner), as_flag(bend, "bend", owner)
+    search = Search(owner, as_model(model, count, start, fixed, owner), seen, middle_of([seen]), robust)
     (result,) = results([search], search.alone(bend), search.free(bend)).cameras
     if not result.converged:
         warn(f"{owner}: {result.failure} (rms {result.rms:.4g} px). Do not use the result; see its warnings")
@@ -173,19 +165,23 @@ class Search:
 
     owner: str  # the function, and the camera's name in a rig, for messages
     asked: Model
-    given: Observations
-    middle: Tensor
-    layout: Layout
-    loss: str | None
-    loss_scale: float
-    prior: Prior | None = None  # of a surface, from its start
+    seen: Observations
+    middle: Tensor  # (3,) of the boards
+    loss: Loss
 
-    def __post_init__(self) -> None:
-        kind, start = self.asked.kind, self.asked.start
-        if start is None or (smooth := kind.smoothness()) is None:
-            return
+    @cached_property
+    def centred(self) -> Observations:
+        """Observations with boards about their middle, which makes a pose's turn and shift nearly independent."""
+        return self.seen._replace(points=torch.where(self.seen.seen[..., None], self.seen.points - self.middle, 0.0))
+
+    @cached_property
+    def observed(self) -> CameraObservations:
+        """The observations for an adjustment, with the prior of a surface that starts from a camera."""
+        kind, start, smooth = self.asked.kind, self.asked.start, self.asked.kind.smoothness()
+        if start is None or smooth is None:
+            return as_seen(kind, self.centred)
         # a surface keeps the start's shape if nothing is seen
-        like = self.given.pixels
+        like = self.seen.pixels
         core, coefficients = (t.detach().to(like).reshape(-1) for t in (start.intrinsics, start.distortion))
         axis = like.new_tensor([[0.0, 0.0, 1.0], [_BESIDE, 0.0, 1.0]])
 
@@ -195,28 +191,19 @@ class Search:
 
         # a surface can imitate a turn of the camera, so its frame is held at the start's
         rows = _SMOOTH * float(core[:2].mean()) * smooth.to(like), torch.func.jacrev(frame)(coefficients)
-        self.prior = Prior(torch.cat((core, coefficients)), torch.nn.functional.pad(torch.cat(rows), (4, 0)))
-
-    @cached_property
-    def seen(self) -> Observations:
-        """Observations with boards about their middle, which makes a pose's turn and shift nearly independent."""
-        points = torch.where(self.given.seen[..., None], self.given.points - self.middle, 0.0)
-        return self.given._replace(points=points)
-
-    @property
-    def observed(self) -> CameraObservations:
-        return as_seen(self.asked.kind, self.seen, self.prior)
+        prior = Prior(torch.cat((core, coefficients)), torch.nn.functional.pad(torch.cat(rows), (4, 0)))
+        return as_seen(kind, self.centred, prior)
 
     def free(self, bend: bool = False) -> Free:
         """Return the unknowns of a search for this camera alone; `bend` adds the board's shape."""
-        return Free((self.asked.free.to(self.given.pixels.device),), (False,), bend=bend)
+        return Free((self.asked.free.to(self.seen.pixels.device),), (False,), bend=bend)
 
     def alone(self, bend: bool = False) -> Adjusted:
         """Return the optimum for this camera's views; poses are searched again and kept if they fit it better."""
-        asked, seen, size = self.asked, self.seen, self.layout.image_size
+        asked, seen = self.asked, self.centred
 
         def optimum(state: State) -> Adjusted:
-            return self.adjusted([self.observed], state, self.free(bend), steps=STEPS)
+            return adjust([self.observed], state, self.free(bend), loss=self.loss, steps=STEPS)
 
         if asked.start is None and asked.kind.smoothness() is not None:
             raise ValueError(
@@ -226,45 +213,39 @@ class Search:
         if asked.start is None:
             fixed = [name for name, free in zip(asked.names, asked.free.tolist(), strict=True) if not free]
             with torch.inference_mode():  # takes a tenth less time, and no graph needs the result
-                first = start_from_nothing(seen, asked.kind, asked.count, size, fixed, self.loss, self.loss_scale)
+                first = start_from_nothing(seen, asked.kind, asked.count, fixed, self.loss)
             first = first.of(torch.arange(1, device=seen.pixels.device))
         else:
             given = torch.cat([t.detach().to(seen.pixels).reshape(1, -1) for t in asked.start.tensors], -1)
-            first = poses_for(Lens(asked.kind, given, Poses.none(1, 1, given), size), seen)
+            first = poses_for(Lens(asked.kind, given, Poses.none(1, 1, given)), seen)
         adjusted = optimum(first)
         for _ in range(3):
-            other = other_poses(adjusted, seen, asked.kind, size)
-            again = adjusted if other is adjusted.state else optimum(other)
+            other = other_poses(adjusted, seen, asked.kind)
+            if other is None:
+                break
+            again = optimum(other)
             if not bool(again.cost < adjusted.cost):
                 break
             adjusted = again
         return adjusted
-
-    def adjusted(self, observed: Sequence[CameraObservations], state: State, free: Free, **options: Any) -> Adjusted:
-        return adjust(observed, state, free, loss=self.loss, loss_scale=self.loss_scale, **options)
 
     def in_best_basin(
         self, camera: int, observed: Sequence[CameraObservations], adjusted: Adjusted, free: Free
     ) -> Adjusted:
         """Return the best optimum of this model's basins, if it has several."""
         state = adjusted.state
-        lens = Lens(self.asked.kind, state.parameters[camera], _seen_from(state, camera), self.layout.image_size)
-        starts = other_cameras(lens, free.parameters[camera].cpu(), self.seen)
+        lens = Lens(self.asked.kind, state.parameters[camera], state.boards_from(camera))
+        starts = other_cameras(lens, free.parameters[camera].cpu(), self.centred)
         if starts is None:
             return adjusted
         first = state.of(torch.zeros(len(starts), dtype=torch.long, device=starts.device))
         parameters = tuple(starts if c == camera else p for c, p in enumerate(first.parameters))
-        others = self.adjusted(observed, first._replace(parameters=parameters), free)
+        others = adjust(observed, first._replace(parameters=parameters), free, loss=self.loss)
         best = others.cost.argmin()[None]
         variance = adjusted.cost / (2 * sum(int((one.weights > 0).sum()) for one in observed))
         if not bool(others.cost[best] < adjusted.cost - _AS_GOOD * variance):  # an equal one does not replace the first
             return adjusted
-        return self.adjusted(observed, others.state.of(best), free, steps=STEPS)
-
-
-def _seen_from(state: State, camera: int) -> Poses:
-    rotations, translations = (t[:, camera, None] for t in state.mounts)
-    return Poses(rotations @ state.boards.rotations, state.boards.translations @ rotations[:, 0].mT + translations)
+        return adjust(observed, others.state.of(best), free, loss=self.loss, steps=STEPS)
 
 
 class Results(NamedTuple):
@@ -285,42 +266,46 @@ def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Resul
     spreads = [spread(adjusted, search.asked.kind, c) for c, search in enumerate(searches)]
     for c, search in enumerate(searches):
         check_determined(adjusted, c, spreads[c], search.asked.names, observed[c], search.owner)
-    given = [search.given for search in searches]
+    loss, given = searches[0].loss, [search.seen for search in searches]
     seen = torch.cat([one.seen for one in given])
     residuals, valid = (torch.cat([t[0] for t in of_all]) for of_all in (adjusted.residuals, adjusted.valid))
     views = torch.stack([one.seen.any(-1) for one in given]).any(0)
-    parameters = unknowns(observed, adjusted, int(views.sum()))
-    inliers, sigma, noise = noise_of(residuals, seen, valid, searches[0].loss, searches[0].loss_scale, parameters)
+    inliers, sigma, noise = noise_of(residuals, seen, valid, loss, unknowns(observed, adjusted, int(views.sum())))
     again = repeats(given, [r[0] for r in adjusted.residuals])  # widen uncertainty as if they were missing
     noise = noise * math.sqrt(len(views) / (len(views) - len(again)))
     cameras, state = [], adjusted.state
     for c, (search, own) in enumerate(zip(searches, inliers.split(len(views)), strict=True)):
-        asked, one, layout = search.asked, search.given, search.layout
-        copies = layout.views[again[one.seen[again].any(-1)]].tolist()
+        asked, one = search.asked, search.seen
+        copies = one.views[again[one.seen[again].any(-1)]].tolist()
         off, has_pixel = adjusted.residuals[c][0], adjusted.valid[c][0]
-        rotations, translations = (t[0] for t in _seen_from(state, c))
         camera = Calibration(
-            camera=asked.camera(state.parameters[c][0], layout.image_size),
-            extrinsics=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ search.middle),
+            camera=asked.camera(state.parameters[c][0], one.image_size),
+            extrinsics=extrinsics_of(state.boards_from(c), search.middle),
             rms=rms_of(off, one.seen),
             sigma=float(sigma),
-            residuals=layout.restore(torch.where(has_pixel[..., None], off, torch.nan)),
-            inliers=layout.restore(own),
+            residuals=one.restore(torch.where(has_pixel[..., None], off, torch.nan)),
+            inliers=one.restore(own),
             parameter_names=asked.names,
             spread=spreads[c].scaled(noise.reshape(1)),
             converged=bool(adjusted.converged[0]) and bool((has_pixel | ~one.seen).all()),
             bend=(float(state.bend[0, 0]), float(state.bend[0, 1])),
-            image_size=layout.image_size,
-            views=tuple(layout.views.tolist()),
+            image_size=one.image_size,
+            views=tuple(one.views.tolist()),
             copies=tuple(copies),
             observations=one,
             adjusted=adjusted,
             point_inliers=own,
-            loss=search.loss,
+            loss=loss.name,
             index=c,
         )
         cameras.append(camera)
     return Results(adjusted, cameras, rms_of(residuals, seen), float(sigma), noise)
+
+
+def extrinsics_of(boards: Poses, middle: Tensor) -> Extrinsics:
+    """Return the poses (V,) of boards, of a single problem, from those about the boards' middle."""
+    rotations, translations = (t[0] for t in boards)
+    return Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ middle)
 
 
 def unknowns(observed: Sequence[CameraObservations], adjusted: Adjusted, views: int) -> float:
@@ -329,10 +314,8 @@ def unknowns(observed: Sequence[CameraObservations], adjusted: Adjusted, views: 
     by_priors = 0.0
     for c, one in enumerate(observed):
         if one.prior:
-            count = len(one.prior.centre)
-            which = [(g, i) for g, (camera, i) in enumerate(equations.columns) if camera == c and i < count]
-            rows, own = [g for g, _ in which], [i for _, i in which]
-            by_priors += float((one.prior.root[:, own] @ shared_factor(equations)[0, rows]).square().sum())
+            places, own = places_of(equations.columns, c, range(len(one.prior.centre)))
+            by_priors += float((one.prior.root[:, own] @ shared_factor(equations)[0, places]).square().sum())
     return len(equations.columns) + 6 * views - by_priors
 
 
@@ -342,9 +325,7 @@ def rms_of(residuals: Tensor, seen: Tensor) -> float:
     return float((lengths.square().sum() / seen.sum().clamp(min=1)).sqrt())
 
 
-def noise_of(
-    residuals: Tensor, seen: Tensor, valid: Tensor, loss: str | None, loss_scale: float, free: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def noise_of(residuals: Tensor, seen: Tensor, valid: Tensor, loss: Loss, free: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return inliers, bool (V, N), sigma (see `Calibration`) and the noise for the covariance; free: parameters."""
 
     def sigma_of(lengths: Tensor) -> Tensor:
@@ -354,10 +335,10 @@ def noise_of(
     inliers = seen & valid
     whole = sigma = sigma_of(lengths[inliers])
     for _ in range(20):
-        found = seen & valid & (lengths < 3 * max(loss_scale, float(sigma)))
+        found = seen & valid & (lengths < 3 * max(loss.scale, float(sigma)))
         if torch.equal(found, inliers):
             break
         inliers, sigma = found, sigma_of(lengths[found])
-    if loss is None:
+    if loss.name is None:
         return inliers, whole, whole
-    return inliers, sigma, noise_under(loss, loss_scale, residuals, seen & valid, free)
+    return inliers, sigma, loss.noise(residuals, seen & valid, free)

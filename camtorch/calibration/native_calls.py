@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from camtorch.calibration.robust import LEAST_SQUARES, Loss
 from camtorch.native import structs
 from camtorch.native.library import library, loaded
 from camtorch.poses.rotations import small_turn
@@ -20,15 +21,14 @@ _LOSSES = {None: structs.LEAST_SQUARES, "huber": structs.HUBER, "cauchy": struct
 _SHARED = 1 << 9  # points of poses for each further thread
 
 
-class Search(NamedTuple):
+class PoseSearch(NamedTuple):
     """Settings of a pose search: the most Levenberg-Marquardt steps, the gain at which it ends, and the loss."""
 
     steps: int
     settled: float
     nothing: float
     damping: float
-    loss: str | None = None
-    loss_scale: float = 1.0
+    loss: Loss = LEAST_SQUARES
 
 
 class Solved(NamedTuple):
@@ -53,12 +53,12 @@ def from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Te
     rotations, translations = rays.new_empty(count, 2, 3, 3), rays.new_empty(count, 2, 3)
     valid = torch.empty(count, 2, dtype=torch.bool, device="cpu")
     call.rays, call.valid = call.keep(rays.contiguous()), valid.data_ptr()
-    _run(call, None, points, rays, weights, Search(0, 0.0, 0.0, 0.0), (rotations, translations))
+    _run(call, None, points, rays, weights, PoseSearch(0, 0.0, 0.0, 0.0), (rotations, translations))
     return rotations, translations, valid
 
 
 def refine_poses(
-    native: Native, points: Tensor, pixels: Tensor, weights: Tensor, start: tuple[Tensor, Tensor], search: Search
+    native: Native, points: Tensor, pixels: Tensor, weights: Tensor, start: tuple[Tensor, Tensor], search: PoseSearch
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return rotations, translations and costs (B,) of the minima near `start`; row b sees points[b % P]."""
     call, costs = structs.Poses(task=structs.REFINED), pixels.new_empty(len(pixels))
@@ -74,7 +74,7 @@ def solve_poses(
     points: Tensor,
     pixels: Tensor,
     weights: Tensor | None,
-    search: Search,
+    search: PoseSearch,
     start: tuple[Tensor, Tensor] | None = None,
     threshold: float = 0.0,
 ) -> Solved:
@@ -107,12 +107,12 @@ def project_views(
     poses: tuple[Tensor, Tensor],
     pixels: Tensor,
     weights: Tensor,
-    loss: tuple[str | None, float],
+    loss: Loss,
     learnt: Sequence[int] | None = None,
 ) -> Errors:
     """Return residuals and weights of points (B, V, N, 3) seen by cameras (B,), or one, at pixels (B, V, N, 2).
 
-    Triangles are made if `learnt` lists the parameters that learn. poses: (B, V, 3, 3), (B, V, 3). loss: name, scale.
+    Triangles are made if `learnt` lists the parameters that learn. poses: (B, V, 3, 3), (B, V, 3).
     """
     compiled, plan, left = loaded(), native.plan, c_int64(0)
     valid = torch.empty(weights.shape, dtype=torch.bool, device="cpu")
@@ -132,7 +132,7 @@ def project_views(
     )
     call.residuals, call.weights, call.valid, call.costs = (t.data_ptr() for t in (residuals, weighed, valid, cost))
     call.problems, call.views, call.count = points.shape[:3]
-    call.loss, call.loss_scale = _LOSSES[loss[0]], loss[1]
+    call.loss, call.loss_scale = _LOSSES[loss.name], loss.scale
     call.learnt, call.columns, call.left = addressof(numbers), size - 1, addressof(left)
     call.view, call.shared = view.data_ptr(), shared.data_ptr()
     compiled.camtorch_views(call)
@@ -145,7 +145,7 @@ def project_views(
     return Errors(residuals, valid, weighed, cost, None if learnt is None else (view, shared))
 
 
-def turn(rotations: Tensor, steps: Tensor) -> Tensor:
+def turned_by(rotations: Tensor, steps: Tensor) -> Tensor:
     """Return rotations (..., 3, 3) after small turns by the first three numbers of steps (..., n)."""
     compiled = library() if rotations.is_cpu and rotations.dtype == torch.float64 else None
     if compiled is None:
@@ -161,7 +161,7 @@ def _run(
     points: Tensor,
     rows: Tensor,
     weights: Tensor | None,
-    search: Search,
+    search: PoseSearch,
     poses: tuple[Tensor, Tensor],
     start: tuple[Tensor, ...] = (),
 ) -> None:
@@ -174,7 +174,7 @@ def _run(
     call.cameras, call.points = None if native is None else native.pointer, call.keep(points.contiguous())
     call.weights = None if weights is None else call.keep(weights.contiguous())
     call.point_rows, call.row_count, call.count = len(points), batch, count
-    call.loss, call.loss_scale, call.steps = _LOSSES[search.loss], search.loss_scale, search.steps
+    call.loss, call.loss_scale, call.steps = _LOSSES[search.loss.name], search.loss.scale, search.steps
     call.settled, call.nothing, call.damping = search.settled, search.nothing, search.damping
     call.rotations, call.translations = (t.data_ptr() for t in poses)
     call.next, call.left = addressof(counters), addressof(counters) + 8

@@ -28,24 +28,23 @@ _NAMED = 6  # views at most, in a message
 
 
 class Observations(NamedTuple):
-    """Corners of boards and their pixels in one camera: float64, padded to the number of the fullest view."""
+    """Corners of boards and their pixels in one camera: float64, padded to the number of the fullest view.
+
+    V are the views that have corners in some camera, of all that were passed.
+    """
 
     points: Tensor  # (V, N, 3) in the board's frame, 0 if padded
     pixels: Tensor  # (V, N, 2), 0 if unseen
     seen: Tensor  # (V, N) bool
-
-    def of(self, views: Tensor) -> Observations:
-        return Observations(*(t[views] for t in self))
-
-
-class Layout(NamedTuple):
-    """The form of one camera's image points as they were passed."""
-
-    shapes: tuple[tuple[int, ...], ...]  # of each view that was passed, without the last dim; (N,) for None
-    stacked: bool  # whether they were one tensor or array, not a list
-    views: Tensor  # (V,) the indices of passed views that have corners
-    seen: Tensor  # (V, N) of the observations
+    views: Tensor  # (V,) their indices among the views that were passed
     image_size: tuple[int, int]  # (height, width)
+    shapes: tuple[tuple[int, ...], ...]  # of each view that was passed, without the last dim; (N,) for None
+    stacked: bool  # whether the image points were one tensor or array, not a list
+
+    def of(self, rows: Tensor) -> Observations:
+        """Return the observations of some views."""
+        points, pixels, seen, views = (t[rows] for t in (self.points, self.pixels, self.seen, self.views))
+        return self._replace(points=points, pixels=pixels, seen=seen, views=views)
 
     def restore(self, values: Tensor) -> Any:
         """Return results (V, N, k) or (V, N) in the form of the image points, NaN (of bool: False) if unseen."""
@@ -57,10 +56,8 @@ class Layout(NamedTuple):
         return [row[: math.prod(shape)].reshape(*shape, *rest) for row, shape in zip(full, self.shapes, strict=True)]
 
 
-def as_observations(
-    object_points: Points, image_points: Points, image_size: Sequence[int], owner: str
-) -> tuple[Observations, Layout]:
-    """Return the observations of one camera, of views that have corners, and the form for its results."""
+def as_observations(object_points: Points, image_points: Points, image_size: Sequence[int], owner: str) -> Observations:
+    """Return the observations of one camera, of views that have corners."""
     return as_rig_observations(object_points, {"": image_points}, {"": image_size}, {"": None}, owner)[""]
 
 
@@ -70,7 +67,7 @@ def as_rig_observations(
     image_sizes: Mapping[str, Sequence[int]],
     models: Mapping[str, Any],
     owner: str,
-) -> dict[str, tuple[Observations, Layout]]:
+) -> dict[str, Observations]:
     """Return the observations of a rig's cameras of the same boards, by name in the order of the models."""
     for argument, given in {"models": models, "image_points": image_points, "image_sizes": image_sizes}.items():
         is_mapping = isinstance(given, Mapping)
@@ -79,18 +76,19 @@ def as_rig_observations(
             words = "models, image_points and image_sizes must be mappings by the same names of cameras"
             raise (ValueError if is_mapping else TypeError)(f"{owner}: {words}; got {got}")
     owners = {name: f"{owner}: {name}" if name else owner for name in models}
-    given = {name: _as_views(image_points[name], 2, "image_points", of) for name, of in owners.items()}
+    by_name = {name: _as_views(image_points[name], 2, "image_points", of) for name, of in owners.items()}
     boards, *_ = _as_views(object_points, 3, "object_points", owner)
-    counts = {name or "image_points": len(views) for name, (views, *_) in given.items()}
-    counts |= {"object_points": len(boards)} if len(boards) > 1 else {}
+    counts = {name or "image_points": len(views) for name, (views, *_) in by_name.items()}
+    if len(boards) > 1:
+        counts["object_points"] = len(boards)
     if len(set(counts.values())) > 1:
         raise ValueError(f"{owner}: all arguments must have the same views; got numbers of views {counts}")
-    device = next(iter(given.values()))[0][0].device
+    count, device = next(iter(counts.values())), next(iter(by_name.values()))[0][0].device
     boards = [board.to(device) for board in boards]
-    boards = boards * next(iter(counts.values())) if len(boards) == 1 else boards
+    boards = boards * count if len(boards) == 1 else boards
     points = pad_sequence(boards, batch_first=True, padding_value=torch.nan)
-    found: dict[str, tuple[Observations, Layout]] = {}
-    for name, (views, shapes, stacked) in given.items():
+    found: dict[str, Observations] = {}  # of all views, NaN if padded or unseen
+    for name, (views, shapes, stacked) in by_name.items():
         size = as_known_size(image_sizes[name], owners[name])
         pixels = torch.full_like(points[..., :2], torch.nan)
         for i, (view, board) in enumerate(zip(views, boards, strict=True)):
@@ -100,14 +98,26 @@ def as_rig_observations(
                     f"(inner ones of a chessboard); got {len(view)}. Pass rows of NaN for corners that were not found"
                 )
             pixels[i, : len(view)] = view
-        seen = ~pixels.isnan().any(-1)
-        _check_corners(points, pixels, seen, owners[name])
-        _check_inside(pixels, seen, size, owners[name])
         forms = tuple((len(b),) if shape is None else shape for b, shape in zip(boards, shapes, strict=True))
-        found[name] = Observations(points, pixels, seen), Layout(forms, stacked, seen, seen, size)
-    sees = torch.stack([observations.seen.any(-1) for observations, _ in found.values()])
-    # cameras must share a view, at least by way of others, with the first
-    names, linked = list(found), torch.arange(len(sees), device=device) == 0
+        every = torch.arange(count, device=device)
+        found[name] = Observations(points, pixels, ~pixels.isnan().any(-1), every, size, forms, stacked)
+        _check_corners(found[name], owners[name])
+        _check_inside(found[name], owners[name])
+    sees = torch.stack([one.seen.any(-1) for one in found.values()])
+    _check_linked(sees, list(found), owner)
+    if not bool(sees.any(0).all()):
+        warn(f"{owner}: {_views_of(~sees.any(0))} left out, because nothing was seen")
+    (kept,) = sees.any(0).nonzero(as_tuple=True)
+    points = points.nan_to_num()
+    for name, one in found.items():
+        pixels = torch.where(one.seen[..., None], one.pixels, 0.0)
+        found[name] = one._replace(points=points, pixels=pixels).of(kept)
+    return found
+
+
+def _check_linked(sees: Tensor, names: Sequence[str], owner: str) -> None:
+    """Raise unless each camera shares a view, at least by way of others, with the first; sees: (C, V) bool."""
+    linked = torch.arange(len(sees), device=sees.device) == 0
     for _ in names:
         linked = linked | (sees & sees[linked].any(0)).any(-1)
     if not bool(linked.all()):
@@ -116,14 +126,6 @@ def as_rig_observations(
             f"{owner}: cameras must share views with {names[0]!r}, directly or through others; got no such view of "
             f"{apart}. Take views that both see, or calibrate it alone"
         )
-    if not bool(sees.any(0).all()):
-        warn(f"{owner}: {_views_of(~sees.any(0))} left out, because nothing was seen")
-    (kept,) = sees.any(0).nonzero(as_tuple=True)
-    for name, (observations, layout) in found.items():
-        pixels = torch.where(observations.seen[..., None], observations.pixels, 0.0)
-        whole = Observations(points.nan_to_num(), pixels, observations.seen).of(kept)
-        found[name] = whole, layout._replace(views=kept, seen=whole.seen)
-    return found
 
 
 def repeats(cameras: Sequence[Observations], residuals: Sequence[Tensor]) -> Tensor:
@@ -185,8 +187,9 @@ def _as_double(value: Any, name: str, owner: str) -> Tensor:
     return as_values(value, name, owner, device).detach().double()
 
 
-def _check_corners(points: Tensor, pixels: Tensor, seen: Tensor, owner: str) -> None:
-    """Raise if corners determine no pose; points (V, N, 3) and pixels (V, N, 2) are NaN if padded."""
+def _check_corners(given: Observations, owner: str) -> None:
+    """Raise if corners determine no pose."""
+    points, pixels, seen = given.points, given.pixels, given.seen
     number = seen.sum(-1)
     if not bool(number.any()):
         raise ValueError(f"{owner}: image_points must have seen corners; got NaN in all views")
@@ -207,8 +210,9 @@ def _check_corners(points: Tensor, pixels: Tensor, seen: Tensor, owner: str) -> 
             raise ValueError(f"{owner}: {_views_of(wrong & (number > 0))}: {words}")
 
 
-def _check_inside(pixels: Tensor, seen: Tensor, size: tuple[int, int], owner: str) -> None:
-    """Raise if pixels do not lie in an image of this size."""
+def _check_inside(given: Observations, owner: str) -> None:
+    """Raise if pixels do not lie in an image of the camera's size."""
+    pixels, seen, size = given.pixels, given.seen, given.image_size
     found = pixels[seen]
 
     def outside(sides: tuple[int, int]) -> Tensor:

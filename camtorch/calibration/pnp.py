@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 
 from camtorch.calibration.batches import as_double_rows, as_tensor, as_vectors, attached, learns, root_of
 from camtorch.calibration.bundle import CameraObservations, Poses, adjust_poses
-from camtorch.calibration.native_calls import Search, Solved, solve_poses
+from camtorch.calibration.native_calls import PoseSearch, Solved, solve_poses
 from camtorch.calibration.ransac import LEAST, consensus
 from camtorch.calibration.rays import poses_from_rays
 from camtorch.cameras.camera import Camera
@@ -30,7 +30,7 @@ _THIN = 0.1  # of the extent of points: thinner ones may have the minima of a pl
 _LINE = 1e-6  # of the extent of points: thinner ones are on a line
 # Starts are near the optimum. `settled` is the squared distance to it, over the variance, at which a search ends, and
 # `nothing` the px that rounding may leave
-_SEARCH = Search(steps=40, settled=1e-7, nothing=1e-9, damping=1e-8)
+_SEARCH = PoseSearch(steps=40, settled=1e-7, nothing=1e-9, damping=1e-8)
 
 
 class _Pose(NamedTuple):

@@ -10,16 +10,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from camtorch.calibration.bundle import Bundle, CameraObservations, Free, Poses, State
-from camtorch.calibration.calibrate import STEPS, Search, as_model, check_options, middle_of, results
+from camtorch.calibration.bundle import Bundle, CameraObservations, Free, Poses, State, adjust
+from camtorch.calibration.calibrate import STEPS, Search, as_model, extrinsics_of, middle_of, results
 from camtorch.calibration.observations import Points, as_rig_observations
+from camtorch.calibration.robust import Loss, as_loss
 from camtorch.calibration.uncertainty import shared_factor
 from camtorch.calibration.verdict import Calibration
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
+from camtorch.least_squares.equations import places_of
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_vector
-from camtorch.values.arguments import hinting, warn
+from camtorch.values.arguments import as_flag, hinting, warn
 from camtorch.values.threads import on_one_thread
 
 
@@ -129,40 +131,39 @@ def calibrate_rig(
     """
     owner = "calibrate_rig"
     by_name = as_rig_observations(object_points, image_points, image_sizes, models, owner)
-    check_options(loss, loss_scale, bend, owner)
+    robust, bend = as_loss(loss, loss_scale, owner), as_flag(bend, "bend", owner)
     for given in (count, start, fixed):
         stray = [name for name in given if name not in by_name] if isinstance(given, Mapping) else []
         if stray:
             unknown = ", ".join(map(repr, stray))
             raise ValueError(f"{owner}: names must be those of cameras, {', '.join(by_name)}; got {unknown}")
-    middle, searches = middle_of([seen for seen, _ in by_name.values()]), []
-    for name, (seen, layout) in by_name.items():
+    middle, searches = middle_of([*by_name.values()]), []
+    for name, seen in by_name.items():
         of = f"{owner}: {name}"
         asked = as_model(models[name], _own(count, name, None), _own(start, name, None), _own(fixed, name, ()), of)
-        searches.append(Search(of, asked, seen, middle, layout, loss, loss_scale))
+        searches.append(Search(of, asked, seen, middle, robust))
     observed = [search.observed for search in searches]
     learns = tuple(parameters for search in searches for parameters in search.free().parameters)
     free = Free(learns, tuple(c > 0 for c in range(len(searches))), bend=bend)
-    first = _join_starts(searches, observed, free)
-    adjusted = searches[0].adjusted(observed, first, free, steps=STEPS)
+    adjusted = adjust(observed, _join_starts(searches, observed, free), free, loss=robust, steps=STEPS)
     found = results(searches, adjusted, free)
     cameras, state = dict(zip(by_name, found.cameras, strict=True)), found.adjusted.state
-    rotations, translations = (t[0] for t in state.boards)
-    posed = zip(by_name, *(t[0] for t in state.mounts), strict=True)
-    mounts = {name: Extrinsics(rotation_vector(r).unsqueeze(-1), t) for name, r, t in posed}
-    names = list(by_name)
-    std = torch.linalg.vector_norm(shared_factor(found.adjusted.equations)[0] * found.noise, dim=-1)
-    stds = {name: std.new_zeros(6) for name in names}
-    for value, (camera, i) in zip(std, found.adjusted.equations.columns, strict=True):
-        if camera >= 0 and i >= (size := found.adjusted.state.parameters[camera].shape[-1]):
-            stds[names[camera]][i - size] = value
+    equations = found.adjusted.equations
+    std = torch.linalg.vector_norm(shared_factor(equations)[0] * found.noise, dim=-1)
+    mounts, mount_std = {}, {}
+    for c, (name, rotation, shift) in enumerate(zip(by_name, *(t[0] for t in state.mounts), strict=True)):
+        mounts[name], mount_std[name] = Extrinsics(rotation_vector(rotation).unsqueeze(-1), shift), std.new_zeros(6)
+        first = state.parameters[c].shape[-1]
+        places, _ = places_of(equations.columns, c, range(first, first + 6))
+        if places:
+            mount_std[name] = std[places]
     result = RigCalibration(
         rig=Rig({name: c.camera for name, c in cameras.items()}, mounts),
-        boards=Extrinsics(rotation_vector(rotations).unsqueeze(-1), translations - rotations @ middle),
+        boards=extrinsics_of(state.boards, middle),
         rms=found.rms,
         sigma=found.sigma,
         cameras=cameras,
-        mount_std=stds,
+        mount_std=mount_std,
         converged=all(c.converged for c in found.cameras),
         bend=found.cameras[0].bend,
         views=found.cameras[0].views,
@@ -181,10 +182,10 @@ def _own(given: Any, name: str, otherwise: Any) -> Any:
 
 def _join_starts(searches: list[Search], observed: list[CameraObservations], free: Free) -> State:
     """Return the start: mounts from pairs that see the same boards, boards from the camera that sees each best."""
-    has_pose, states = [search.given.seen.any(-1) for search in searches], []
+    has_pose, states = [search.seen.seen.any(-1) for search in searches], []
     for search, has in zip(searches, has_pose, strict=True):
-        state = replace(search, given=search.given.of(has)).alone().state
-        boards = Poses.none(1, len(has), search.given.pixels).with_views(has.nonzero()[:, 0], state.boards)
+        state = replace(search, seen=search.seen.of(has)).alone().state
+        boards = Poses.none(1, len(has), search.seen.pixels).with_views(has.nonzero()[:, 0], state.boards)
         states.append(state._replace(boards=boards))
     parameters = tuple(state.parameters[0] for state in states)
     mounts = Poses.none(1, len(states), parameters[0])
@@ -212,9 +213,8 @@ def _join_starts(searches: list[Search], observed: list[CameraObservations], fre
     for c, one in enumerate(states):
         own = Poses(turns[c].mT @ one.boards.rotations, (one.boards.translations - shifts[c]) @ turns[c])
         state = State(parameters, mounts, own, own.translations.new_zeros(1, 2))
-        bundle = Bundle(observed, state, free, "cauchy", 1.0)
-        flat = bundle.flat(state)
-        cost = torch.stack([bundle.errors_of(k, flat).cost[0] for k in range(len(observed))]).sum(0)
+        bundle = Bundle(observed, state, free, Loss("cauchy"))
+        cost = torch.stack([errors.cost[0] for errors in bundle.all_errors(bundle.flat(state), bundle.every)]).sum(0)
         better = has_pose[c] & (cost < least)
         least = torch.where(better, cost, least)
         boards = Poses.where(better, own, boards)

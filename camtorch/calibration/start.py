@@ -12,6 +12,7 @@ from torch import Tensor
 from camtorch.calibration.bundle import SETTLED, Adjusted, CameraObservations, Free, Poses, Prior, State, adjust, minima
 from camtorch.calibration.observations import Observations
 from camtorch.calibration.rays import poses_from_rays
+from camtorch.calibration.robust import LEAST_SQUARES, Loss
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.freezing import INTRINSICS
 from camtorch.cameras.operators import fixed_camera
@@ -60,10 +61,8 @@ def start_from_nothing(
     observations: Observations,
     model: type[Camera],
     count: int,
-    image_size: tuple[int, int],
     fixed: Collection[str] = (),
-    loss: str | None = None,
-    loss_scale: float = 1.0,
+    loss: Loss = LEAST_SQUARES,
 ) -> State:
     """Return a camera of the model, B = 1, and the poses of all views, from which an adjustment reaches the optimum.
 
@@ -71,16 +70,16 @@ def start_from_nothing(
     few are refined with a Cauchy loss, and the model is fitted to the best one from several starts. Parameters in
     `fixed` are held: coefficients as in `Camera.ideal`, the principal point in the middle of the image.
     """
-    few, free = _subsample(observations, image_size), _free_parameters(model, count, fixed)
-    lens = first = _find_unified(few, image_size, fixed)
+    few, free = _subsample(observations), _free_parameters(model, count, fixed)
+    lens = first = _find_unified(few, fixed)
     bounds = [model.fit_bounds.get(name, ()) for name in model.names_of(count) or ()]
     if bounds and all(ends is None for ends in bounds):
         # a model that keeps its start's shape takes that of a good lens
         good = _fit_model(lens, few, KannalaBrandt, 4, fixed)
-        lens = _refine(good, few, _free_parameters(KannalaBrandt, 4, fixed), ("cauchy", lens.scale)).of(slice(1))
+        lens = _refine(good, few, _free_parameters(KannalaBrandt, 4, fixed), Loss("cauchy", lens.scale)).of(slice(1))
     lens = _fit_model(lens, few, model, count, fixed)
     if few is not observations or len(lens.parameters) > 1 or bool(lens.lost(few).any()):
-        lens = _refine(lens, few, free, (loss, loss_scale))
+        lens = _refine(lens, few, free, loss)
         one = lens.of(slice(1))
         lost, seen = int(one.lost(few).sum()), int(few.seen.sum())
         if lost > (_LOST * seen if one.scale <= _ERRS * first.scale else 0):
@@ -94,7 +93,7 @@ def start_from_nothing(
         return state
     lens = lens._replace(boards=state.boards.expand(len(lens.parameters)))
     observed = [as_seen(model, observations)]
-    found = adjust(observed, lens.state, free, loss=loss, loss_scale=loss_scale, steps=_MANY_STEPS)
+    found = adjust(observed, lens.state, free, loss=loss, steps=_MANY_STEPS)
     return found.state.of(found.cost.argmin()[None])
 
 
@@ -104,10 +103,10 @@ def poses_for(lens: Lens, observations: Observations) -> State:
     return _choose_poses(lens._replace(boards=boards), observations, errors).state
 
 
-def other_poses(found: Adjusted, observations: Observations, model: type[Camera], image_size: tuple[int, int]) -> State:
-    """Return the state of an optimum, B = 1, with better poses for views that have them; the same state if none has."""
+def other_poses(found: Adjusted, observations: Observations, model: type[Camera]) -> State | None:
+    """Return the state of an optimum, B = 1, with better poses for views that have them; None if none has."""
     state = found.state
-    lens = Lens(model, state.parameters[0], state.boards, image_size)
+    lens = Lens(model, state.parameters[0], state.boards)
     errors = _lengths(found.residuals[0], found.valid[0], observations.seen)[0]
     # views with greater errors than many others are doubted
     rows = errors.nanmedian(-1).values.argsort(descending=True)[:50]
@@ -119,7 +118,7 @@ def other_poses(found: Adjusted, observations: Observations, model: type[Camera]
     shift = torch.linalg.vector_norm(others.translations - boards.translations, dim=-1)
     is_other = (cosine < math.cos(_OTHER)) | (shift > _OTHER * torch.linalg.vector_norm(boards.translations, dim=-1))
     if not bool(is_other.any()):
-        return state
+        return None
     return state._replace(boards=state.boards.with_views(rows, Poses.where(is_other[0], others, boards)))
 
 
@@ -141,7 +140,6 @@ class Lens(NamedTuple):
     model: type[Camera]
     parameters: Tensor
     boards: Poses
-    image_size: tuple[int, int]
     scale: float = _LEAST_SCALE  # px: twice the median error of corners, from which they count less
 
     @property
@@ -150,7 +148,7 @@ class Lens(NamedTuple):
 
     @property
     def camera(self) -> Camera:
-        return fixed_camera(self.model, self.parameters[:, :4], self.parameters[:, 4:], self.image_size)
+        return fixed_camera(self.model, self.parameters[:, :4], self.parameters[:, 4:])
 
     def lost(self, some: Observations) -> Tensor:
         """Whether seen corners have no pixel, (B, V, N) bool."""
@@ -160,14 +158,11 @@ class Lens(NamedTuple):
     def of(self, rows: Tensor | slice) -> Lens:
         return self._replace(parameters=self.parameters[rows], boards=self.boards.of(rows))
 
-    def adjusted(
-        self, few: Observations, free: Free, steps: int, worst: float, loss: tuple[str | None, float] | None = None
-    ) -> Lens:
+    def adjusted(self, few: Observations, free: Free, steps: int, worst: float, loss: Loss | None = None) -> Lens:
         """Return adjusted cameras, the best first, without doubles and costs above `worst` times the least."""
-        name, scale = loss or ("cauchy", self.scale)
         settled = _NEARLY if loss is None else SETTLED
-        observed = as_seen(self.model, few)
-        found = adjust([observed], self.state, free, loss=name, loss_scale=scale, steps=steps, settled=settled)
+        loss = loss or Loss("cauchy", self.scale)
+        found = adjust([as_seen(self.model, few)], self.state, free, loss=loss, steps=steps, settled=settled)
         cost, rows = found.cost.sort()
         near = cost <= worst * cost[0]
         near[1:] &= cost.diff() > _SAME * cost[:-1]
@@ -180,8 +175,8 @@ class Lens(NamedTuple):
 
 def as_seen(model: type[Camera], observations: Observations, prior: Prior | None = None) -> CameraObservations:
     """Return the observations of one camera, for one problem."""
-    points, pixels, seen = observations
-    return CameraObservations(model, points[None], pixels[None], seen[None].to(pixels.dtype), prior)
+    points, pixels, weights = observations.points, observations.pixels, observations.seen.to(observations.pixels)
+    return CameraObservations(model, points[None], pixels[None], weights[None], prior)
 
 
 def _free_parameters(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
@@ -191,14 +186,14 @@ def _free_parameters(model: type[Camera], count: int, fixed: Collection[str]) ->
     return Free((torch.tensor(learns, device="cpu"),), (False,))
 
 
-def _subsample(observations: Observations, image_size: tuple[int, int]) -> Observations:
+def _subsample(observations: Observations) -> Observations:
     """Return the views with most corners, and enough corners of each, evenly from the image's middle outwards."""
     if len(observations.seen) > _VIEWS:
         observations = observations.of(observations.seen.sum(-1).argsort(descending=True)[:_VIEWS].sort().values)
-    points, pixels, seen = observations
+    points, pixels, seen = observations.points, observations.pixels, observations.seen
     if seen.shape[1] <= _POINTS:
         return observations
-    distances = torch.linalg.vector_norm(pixels - _middle(image_size, pixels), dim=-1)
+    distances = torch.linalg.vector_norm(pixels - _middle(observations), dim=-1)
     order = torch.where(seen, distances, torch.inf).argsort(-1)
     share = torch.linspace(0, 1, _POINTS, dtype=pixels.dtype, device=pixels.device)
     index = order.gather(-1, (share * (seen.sum(-1, keepdim=True) - 1).clamp(min=0)).round().long())
@@ -207,19 +202,21 @@ def _subsample(observations: Observations, image_size: tuple[int, int]) -> Obser
     return observations._replace(points=points, pixels=pixels, seen=seen.gather(-1, index) & once)
 
 
-def _middle(image_size: tuple[int, int], like: Tensor) -> Tensor:
-    return like.new_tensor([(image_size[1] - 1) / 2, (image_size[0] - 1) / 2])
+def _middle(observations: Observations) -> Tensor:
+    """Return the middle (2,) of the image."""
+    height, width = observations.image_size
+    return observations.pixels.new_tensor([(width - 1) / 2, (height - 1) / 2])
 
 
-def _find_unified(few: Observations, image_size: tuple[int, int], fixed: Collection[str]) -> Lens:
-    centre = _middle(image_size, few.pixels)
+def _find_unified(few: Observations, fixed: Collection[str]) -> Lens:
+    centre = _middle(few)
     reach = torch.where(few.seen, torch.linalg.vector_norm(few.pixels - centre, dim=-1), 0.0).amax()
     tried = [(alpha, math.radians(degrees)) for alpha, angles in _TRIED.items() for degrees in angles]
     radii = [math.sin(theta) / (alpha + (1 - alpha) * math.cos(theta)) for alpha, theta in tried]
     focal = reach / centre.new_tensor(radii)[:, None]
     alpha = centre.new_tensor([alpha for alpha, _ in tried])[:, None]
     parameters = torch.cat((focal, focal, centre.expand(len(tried), 2), alpha), -1)
-    lens = Lens(UCM, parameters, Poses.none(1, 1, parameters), image_size)
+    lens = Lens(UCM, parameters, Poses.none(1, 1, parameters))
     begun = None
     # rounds, the most lenses kept after these, and their largest error over the best one's
     for rounds, kept, unlike in ((1, len(tried), 4.0), (_ROUNDS, 3, 2.0)):
@@ -323,14 +320,15 @@ def _choose_poses(lens: Lens, some: Observations, errors: Tensor) -> Lens:
     if len(rows) == 0:
         return lens._replace(boards=first)
     both = Poses(*(torch.cat((a[0, rows], b[0, rows]))[:, None] for a, b in zip(first, second, strict=True)))
-    poses, cost = minima(lens.model, lens.parameters, both, some.of(rows.repeat(2)), ("cauchy", lens.scale), _FEW_STEPS)
+    twice, loss = some.of(rows.repeat(2)), Loss("cauchy", lens.scale)
+    poses, cost = minima(lens.model, lens.parameters, both, twice, loss, _FEW_STEPS)
     halves = slice(len(rows)), slice(len(rows), None)
     a, b = (Poses(*(t[half].transpose(0, 1) for t in poses)) for half in halves)
     better = Poses.where(cost[halves[0]] <= cost[halves[1]], a, b)
     return lens._replace(boards=first.with_views(rows, better))
 
 
-def _refine(lens: Lens, few: Observations, free: Free, loss: tuple[str | None, float]) -> Lens:
+def _refine(lens: Lens, few: Observations, free: Free, loss: Loss) -> Lens:
     """Refine the cameras by a few steps, drop all but the nearly best, and refine the rest; the best comes first."""
     lens = lens.adjusted(few, free, _STEPS, _WORSE, loss)
     return lens if len(lens.parameters) == 1 else lens.adjusted(few, free, _MANY_STEPS, _LITTLE_WORSE, loss)
@@ -363,7 +361,7 @@ def _fit_model(lens: Lens, few: Observations, model: type[Camera], count: int, f
     begun = torch.cat([some for some, _ in sets])
     held = torch.cat([torch.where(stays, some, torch.nan) for some, stays in sets])
     held = torch.nn.functional.pad(held, (4, 0), value=torch.nan)
-    template = fixed_camera(model, slopes[:1], ideal[None], lens.image_size)
+    template = fixed_camera(model, slopes[:1], ideal[None])
     seen = fitting.Observations(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
     seen = fitting.Observations(*(t.expand(len(begun), *t.shape[1:]) for t in seen))
     slopes = slopes.expand(len(begun), -1)
@@ -376,7 +374,7 @@ def _fit_model(lens: Lens, few: Observations, model: type[Camera], count: int, f
     # cameras that nearly equal an earlier one are dropped
     apart = (parameters[:, None] - parameters).abs() > _ALIKE * (parameters.abs() + _ALIKE)
     parameters = parameters[~(~apart.any(-1)).tril(-1).any(-1)]
-    for i, name in enumerate(("cx", "cy"), 2):
+    for i, name in enumerate(("cx", "cy")):
         if name in fixed:
-            parameters[:, i] = (lens.image_size[3 - i] - 1) / 2
+            parameters[:, 2 + i] = _middle(few)[i]
     return lens._replace(model=model, parameters=parameters, boards=lens.boards.expand(len(parameters)))

@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from camtorch.calibration.batches import as_double_rows, as_tensor, attached, learns, root_of
-from camtorch.calibration.bundle import Bundle, CameraObservations, Free, Poses, State
+from camtorch.calibration.bundle import CameraObservations, Free, Poses, State, adjust
 from camtorch.cameras.camera import Camera
-from camtorch.least_squares.levenberg_marquardt import minimise
+from camtorch.least_squares.equations import System
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.values.arguments import Numbers, check_devices, hinting, shown, working_dtype
 from camtorch.values.module import BatchedModule, model_of
@@ -170,17 +170,18 @@ def _solve(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
     seen_by = zip(map(model_of, task.cameras), pixels[..., None, None, :], seen[..., None, None], strict=True)
     observed = [CameraObservations(model, start.new_zeros(count, 1, 1, 3), *rest) for model, *rest in seen_by]
     held = tuple(torch.zeros(p.shape[-1], dtype=torch.bool, device=p.device) for p in parameters)
-    problem = Bundle(observed, state, Free(held, (False,) * len(observed), "positions"), None, 1.0)
-    flat, tolerance, tiny = problem.flat(state), _SETTLED / (2 * views - 3).clamp(min=1), _NOTHING**2 * views
-    found = minimise(problem, flat, tolerance=tolerance, tiny=tiny, going=views >= 2, steps=_STEPS, damping=_DAMPING)
-    system = problem.linearised(found.state, torch.arange(count, device=start.device))
-    (step, _), _ = system.step(torch.zeros_like(found.cost))
-    points = (found.state[1][:, 0] - shift) @ first
+    free = Free(held, (False,) * len(observed), "positions")
+    found = adjust(
+        observed, state, free, steps=_STEPS, settled=_SETTLED, nothing=_NOTHING, damping=_DAMPING, going=views >= 2
+    )
+    none_held = torch.zeros(count, 0, dtype=torch.bool, device=start.device)
+    (step, _), _ = System(found.equations, 3, none_held).step(torch.zeros_like(found.cost))
+    points = (found.state.boards.translations[:, 0] - shift) @ first
     valid = found.converged & (views >= 2) & _is_ahead(points, positions, rays, task.seen)
     valid &= step[:, 0].norm(dim=-1) <= _FLEEING * (points - middle).norm(dim=-1)
     valid &= torch.isfinite(points).all(-1)
-    for c in range(len(observed)):
-        valid &= problem.errors_of(c, found.state).valid[:, 0, 0] | ~task.seen[c]
+    for has_pixel, is_seen in zip(found.valid, task.seen, strict=True):
+        valid &= has_pixel[:, 0, 0] | ~is_seen
     return torch.where(torch.isfinite(points), points, 0.0), valid
 
 

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.calibration.bundle import Adjusted, pixel_jacobians, robust
+from camtorch.calibration.bundle import Adjusted, pixel_jacobians
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import fixed_camera
-from camtorch.least_squares.equations import Equations
+from camtorch.least_squares.equations import Equations, places_of
 from camtorch.poses.rotations import skew_matrix
 from camtorch.values.arguments import Numbers, as_coordinates, as_values
 
@@ -89,8 +89,8 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
     frame = torch.cat((by_shared @ shared, torch.linalg.qr(by_noise.mT, mode="r").R.mT), -1)
     count = parameters.shape[-1]
     own = shared.new_zeros(len(shared), count + 6, shared.shape[-1])
-    of_own = [(g, i) for g, (c, i) in enumerate(equations.columns) if c == camera]
-    own[:, [i for _, i in of_own]] = shared[:, [g for g, _ in of_own]]
+    places, indices = places_of(equations.columns, camera, range(count + 6))
+    own[:, indices] = shared[:, places]
     turn, shift = own[:, count : count + 3], own[:, count + 3 :]
     # the first camera's frame, moved to this camera's
     rotation = mounts.rotations[:, camera]
@@ -101,25 +101,6 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
     own = torch.cat((own[:, :count], none[:, :1].expand(-1, count, -1)), -1)
     factor = torch.cat((own, turn, shift), 1)
     return Spread(model, parameters.expand(len(factor), -1), factor)
-
-
-def noise_under(loss: str | None, loss_scale: float, residuals: Tensor, seen: Tensor, free: float) -> Tensor:
-    """Return the noise (*B,), px per coordinate, at which a weighted problem has the covariance of its optimum.
-
-    Without a loss it is sqrt(sum of squares / (2 N - free)). With weights w of the squares s of a robust loss it is
-    sqrt(mean(w^2 s) mean(w)) / mean(w + s dw/ds), the scale of an M-estimator, which is right if outliers fall on all
-    corners alike. residuals: (*B, V, N, 2). free: number of free parameters, poses included.
-    """
-    squares = residuals.square().sum(-1)
-    _, weights = robust(loss, loss_scale, squares)
-    change = torch.zeros_like(weights)
-    if loss == "huber":
-        change = torch.where(weights < 1, -weights / 2, 0.0)
-    elif loss == "cauchy":
-        change = weights * (weights - 1)
-    terms = weights.square() * squares, weights, weights + change, torch.ones_like(weights)
-    force, weight, slope, count = ((term * seen).sum((-1, -2)) for term in terms)
-    return (force / (2 * count - free).clamp(min=1) * weight * count).sqrt() / slope.clamp(min=1)
 
 
 def shared_factor(equations: Equations) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from ctypes import addressof, c_int64
 from typing import NamedTuple
 
@@ -22,6 +23,12 @@ class Equations(NamedTuple):
     view: Tensor  # (B, V, L, L + G + 1)
     shared: Tensor  # (B, G + 1, G + 1): the rest of all views
     columns: tuple[tuple[int, int], ...] = ()  # (G,)
+
+
+def places_of(columns: Sequence[tuple[int, int]], camera: int, indices: range) -> tuple[list[int], list[int]]:
+    """Return the places of a camera's unknowns among `columns`, of those that have one of the indices, and these."""
+    found = [(place, index) for place, (of, index) in enumerate(columns) if of == camera and index in indices]
+    return [place for place, _ in found], [index for _, index in found]
 
 
 _NOTHING = 1e-20  # of a column's squares: the rounding left of a column that is a sum of others

@@ -24,7 +24,7 @@ def refuses(*words, error=ValueError):
 
 
 def same(found, expected_points, expected_pixels):
-    for t, expected in zip(found[0][:2], (expected_points, expected_pixels), strict=True):
+    for t, expected in zip(found[:2], (expected_points, expected_pixels), strict=True):
         assert t.dtype == torch.float64
         torch.testing.assert_close(t, torch.as_tensor(expected).double(), rtol=0, atol=0)
 
@@ -55,14 +55,13 @@ FORMS += [[v[:, None] for v in VIEWS], [v[None] for v in VIEWS]]
 
 @pytest.mark.parametrize("image_points", FORMS)
 def test_forms_of_image_points_and_back(image_points):
-    found = as_observations(BOARD, image_points, SIZE, OWNER)
-    same(found, REPEATED, VIEWS)
-    (observations, layout) = found
+    observations = as_observations(BOARD, image_points, SIZE, OWNER)
+    same(observations, REPEATED, VIEWS)
     assert not observations.pixels.requires_grad
     assert observations.seen.all()
-    assert layout.image_size == SIZE
+    assert observations.image_size == SIZE
     for values, size in ((observations.pixels, (2,)), (observations.seen, ()), (observations.pixels[..., 0], ())):
-        back = layout.restore(values)
+        back = observations.restore(values)
         assert isinstance(back, torch.Tensor if isinstance(image_points, (torch.Tensor, np.ndarray)) else list)
         for one, view, value in zip(back, image_points, values, strict=True):
             assert tuple(one.shape) == (*np.shape(np.asarray(view) if isinstance(view, list) else view)[:-1], *size)
@@ -79,11 +78,11 @@ def test_numbers_of_all_kinds():
 def test_nan_is_unseen_and_boards_may_lack_what_is_unseen():
     image_points, points = VIEWS.copy(), REPEATED.copy()
     image_points[1, 5:7] = image_points[0, 2] = image_points[1, 7, 0] = points[1, 5] = np.nan
-    observations, layout = as_observations(points, image_points, SIZE, OWNER)
+    observations = as_observations(points, image_points, SIZE, OWNER)
     assert (~observations.seen).nonzero().tolist() == [[0, 2], [1, 5], [1, 6], [1, 7]]
     assert (observations.pixels[1, 5:8] == 0).all()
     assert (observations.points[1, 5] == 0).all()
-    back, inliers = layout.restore(observations.pixels), layout.restore(torch.ones_like(observations.seen))
+    back, inliers = observations.restore(observations.pixels), observations.restore(torch.ones_like(observations.seen))
     assert back[1][5:8].isnan().all()
     assert not inliers[1][5:8].any()
 
@@ -92,11 +91,11 @@ def test_nan_is_unseen_and_boards_may_lack_what_is_unseen():
 def test_views_without_corners_are_left_out(empty):
     image_points = [VIEWS[0], empty, VIEWS[2], VIEWS[3], empty]
     with pytest.warns(UserWarning, match=r"views 1, 4 left out, because") as caught:
-        observations, layout = as_observations([BOARD] * 5, image_points, SIZE, OWNER)
+        observations = as_observations([BOARD] * 5, image_points, SIZE, OWNER)
     assert len(caught) == 1
-    assert layout.views.tolist() == [0, 2, 3]
-    same((observations, layout), REPEATED[:3], VIEWS[[0, 2, 3]])
-    back = layout.restore(observations.pixels)
+    assert observations.views.tolist() == [0, 2, 3]
+    same(observations, REPEATED[:3], VIEWS[[0, 2, 3]])
+    back = observations.restore(observations.pixels)
     assert len(back) == 5
     assert back[1].isnan().all()
     assert tuple(back[1].shape) == (np.shape(empty)[0] if empty is not None else 54, 2)
@@ -105,17 +104,17 @@ def test_views_without_corners_are_left_out(empty):
 def test_views_of_different_corners():
     which = [np.arange(54), np.arange(10, 40), np.arange(0, 54, 3)]
     points, image_points = [BOARD[w] for w in which], [VIEWS[i][w][:, None] for i, w in enumerate(which)]
-    observations, layout = as_observations(points, image_points, SIZE, OWNER)
+    observations = as_observations(points, image_points, SIZE, OWNER)
     assert observations.seen.sum(-1).tolist() == [54, 30, 18]
     assert observations.seen.shape == (3, 54)
-    for back, given in zip(layout.restore(observations.pixels), image_points, strict=True):
+    for back, given in zip(observations.restore(observations.pixels), image_points, strict=True):
         torch.testing.assert_close(back, torch.from_numpy(given).double(), rtol=0, atol=0)
-    inliers = layout.restore(observations.seen)
+    inliers = observations.restore(observations.seen)
     assert [tuple(t.shape) for t in inliers] == [(54, 1), (30, 1), (18, 1)]
     points[1] = None
     image_points[1] = None
     with pytest.warns(UserWarning, match="view 1"):
-        assert len(as_observations(points, image_points, SIZE, OWNER)[0].seen) == 2
+        assert len(as_observations(points, image_points, SIZE, OWNER).seen) == 2
 
 
 def changed(index, value):
@@ -174,7 +173,7 @@ def test_what_is_no_points(object_points, image_points, words):
 
 def test_sizes_of_images():
     for size in ((480, 640), [480, 640], np.array([480, 640]), torch.Size(SIZE)):
-        assert as_observations(BOARD, VIEWS, size, OWNER)[1].image_size == SIZE
+        assert as_observations(BOARD, VIEWS, size, OWNER).image_size == SIZE
     with refuses("image_size", "(640, 480)", "is (height, width)"):
         as_observations(BOARD, VIEWS, (640, 480), OWNER)
     with refuses("image_size", "(height, width)", "None", error=TypeError):
@@ -185,7 +184,7 @@ def test_corners_at_the_rim_and_a_few_outliers_are_taken():
     image_points = VIEWS.copy()
     image_points[0, 0] = -3.0  # just outside
     image_points[:, :3] += 300.0  # gross outliers, some of them outside
-    assert as_observations(BOARD, image_points, SIZE, OWNER)[0].seen.all()
+    assert as_observations(BOARD, image_points, SIZE, OWNER).seen.all()
 
 
 MODELS = {"left": "kannala_brandt", "right": "kannala_brandt"}
@@ -201,15 +200,14 @@ def test_cameras_of_a_rig_see_the_same_boards():
     with pytest.warns(UserWarning, match="view 4 left out"):
         found = as_rig_observations(BOARD, points, SIZES, MODELS, OWNER)
     assert list(found) == ["left", "right"]
-    observations, layouts = ({name: pair[i] for name, pair in found.items()} for i in range(2))
-    for of in observations.values():
+    for of in found.values():
         assert of.points.tolist() == REPEATED[:4].tolist()
-    assert observations["left"].seen.sum(-1).tolist() == [54, 54, 53, 54]
-    assert observations["right"].seen.sum(-1).tolist() == [0, 54, 54, 54]
-    assert layouts["right"].image_size == (600, 800)
-    back = layouts["left"].restore(observations["left"].pixels)
+    assert found["left"].seen.sum(-1).tolist() == [54, 54, 53, 54]
+    assert found["right"].seen.sum(-1).tolist() == [0, 54, 54, 54]
+    assert found["right"].image_size == (600, 800)
+    back = found["left"].restore(found["left"].pixels)
     torch.testing.assert_close(back, torch.from_numpy(left).double(), rtol=0, atol=0, equal_nan=True)
-    back = layouts["right"].restore(observations["right"].pixels)
+    back = found["right"].restore(found["right"].pixels)
     assert [tuple(t.shape) for t in back] == [(54, 2)] * 5
     assert [bool(t.isnan().any()) for t in back] == [True, False, False, False, True]
 
@@ -244,4 +242,4 @@ def test_bad_rigs(changes, words):
 def test_cameras_linked_by_another():
     points = {"a": [*VIEWS[:2], None, None], "b": [None, None, *VIEWS[2:4]], "c": [None, VIEWS[1], VIEWS[2], None]}
     found = as_rig_observations(BOARD, points, dict.fromkeys("abc", SIZE), dict.fromkeys("abc"), OWNER)
-    assert [of.seen.any(-1).sum().item() for of, _ in found.values()] == [2, 2, 2]
+    assert [of.seen.any(-1).sum().item() for of in found.values()] == [2, 2, 2]

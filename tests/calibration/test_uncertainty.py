@@ -8,7 +8,8 @@ from boards import seen_by
 
 import camtorch as ct
 from camtorch.calibration.bundle import CameraObservations, Free, Poses, State, adjust, pixel_jacobians
-from camtorch.calibration.uncertainty import noise_under, spread, uncertainty
+from camtorch.calibration.robust import Loss
+from camtorch.calibration.uncertainty import spread, uncertainty
 from camtorch.poses.rotations import rotation_matrix
 
 pytestmark = pytest.mark.slow
@@ -123,10 +124,10 @@ def robustly(loss, scale, share, batch):
     bad = torch.rand(observed.pixels.shape[:-1], generator=generator) < share
     push = 40 * (torch.rand(observed.pixels.shape, generator=generator, **F64) - 0.5)
     observed = observed._replace(pixels=observed.pixels + bad[..., None] * push)
-    adjusted = adjust([observed], problem.state(batch), free, loss=loss, loss_scale=scale, steps=200)
+    adjusted = adjust([observed], problem.state(batch), free, loss=Loss(loss, scale), steps=200)
     assert bool(adjusted.converged.all())
     unknowns = len(free.parameters[0]) + 6 * 24
-    noise = noise_under(loss, scale, adjusted.residuals[0], problem.seen[0][None], unknowns)
+    noise = Loss(loss, scale).noise(adjusted.residuals[0], problem.seen[0][None], unknowns)
     values = spread(adjusted, ct.KannalaBrandt, 0).scaled(noise)
     return adjusted.state.parameters[0] - problem.parameters[0], values.std, noise
 
