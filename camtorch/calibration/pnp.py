@@ -120,19 +120,11 @@ def solve_pnp(
     given = _Given.of(camera, object_points, pixels, weights)
     with torch.no_grad():
         found = _solve_compiled(given, threshold) or _solve_anywhere(given, threshold)
-    vectors, translations, rms = found.vectors, found.translations, found.rms
     if learns([given.camera], *(t for t in given[1:4] if t is not None)):
-        task = _Task.of(given)  # the poses and the root mean squares with their derivatives
-        task = task._replace(weights=torch.where(found.inliers, task.weights, 0.0))
-        middles = task.middles[..., None]
-        centred = translations + (rotation_matrix(vectors) @ middles)[..., 0]
-        unknowns = attached(task.cost, torch.cat((vectors, centred), -1), found.valid)
-        vectors, centred = unknowns.split(3, -1)
-        translations = centred - (rotation_matrix(vectors) @ middles)[..., 0]
-        means = 2 * task.cost(unknowns) / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
-        rms = root_of(means, found.valid)
+        found = _attached(given, found)
     vectors, translations, rms, covariance = (
-        t.to(given.dtype).view(given.batch + t.shape[1:]) for t in (vectors, translations, rms, found.covariance)
+        t.to(given.dtype).view(given.batch + t.shape[1:])
+        for t in (found.vectors, found.translations, found.rms, found.covariance)
     )
     valid, inliers = (t.view(given.batch + t.shape[1:]) for t in (found.valid, found.inliers))
     pose = remade(_identity(), rotation=vectors, translation=translations)  # frozen, with the graph of its tensors
@@ -193,12 +185,24 @@ class _Given(NamedTuple):
 
 
 def _solve_compiled(given: _Given, threshold: float | None) -> Solved | None:
-    points, pixels = given.points.detach(), given.pixels.detach()
-    if not len(pixels) or (made := native_forms([given.camera], pixels)) is None:
+    made = native_forms([given.camera], given.pixels)
+    if made is None or not len(given.pixels):
         return None
-    weights = None if given.weights is None else given.weights.detach()
     start = None if threshold is None else _consensus(_Task.of(given), threshold)
-    return solve_poses(made[0][0], points, pixels, weights, _SEARCH, start, threshold or 0.0)
+    return solve_poses(made[0][0], given.points, given.pixels, given.weights, _SEARCH, start, threshold or 0.0)
+
+
+def _attached(given: _Given, found: Solved) -> Solved:
+    """Return the poses and the root mean squares with their derivatives."""
+    task = _Task.of(given)
+    task = task._replace(weights=torch.where(found.inliers, task.weights, 0.0))
+    middles = task.middles[..., None]
+    centred = found.translations + (rotation_matrix(found.vectors) @ middles)[..., 0]
+    unknowns = attached(task.cost, torch.cat((found.vectors, centred), -1), found.valid)
+    vectors, centred = unknowns.split(3, -1)
+    translations = centred - (rotation_matrix(vectors) @ middles)[..., 0]
+    means = 2 * task.cost(unknowns) / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)
+    return found._replace(vectors=vectors, translations=translations, rms=root_of(means, found.valid))
 
 
 class _Task(NamedTuple):
@@ -244,57 +248,77 @@ def _consensus(task: _Task, threshold: float) -> tuple[Tensor, Tensor]:
 
 
 def _solve_anywhere(given: _Given, threshold: float | None) -> Solved:
-    given = given._replace(points=given.points.detach(), pixels=given.pixels.detach())
-    task = _Task.of(given if given.weights is None else given._replace(weights=given.weights.detach()))
-    weights = task.weights
+    task = _Task.of(given)
     if threshold is None:
-        starts = poses_from_rays(task.points, task.rays, weights)
-        found = _take_best([_minimum(task, *(t[:, i] for t in starts)) for i in range(2)])
-        # the other minimum of points on a plane may be one for pixels and not for rays, with few points or much noise
-        share = task.weights / task.weights.sum(-1, keepdim=True)
-        centre = (share[..., None] * task.points).sum(-2)
-        about = task.points - centre[:, None]
-        variances, axes = torch.linalg.eigh(((share[..., None] * about).mT @ about).nan_to_num(0.0))
-        flat, normal = variances[:, 0] <= _THIN**2 * variances[:, 2], axes[..., 0]
-        middle = (found.rotations @ centre[..., None])[..., 0] + found.translations
-        across_sight, in_plane = (
-            torch.eye(3, dtype=v.dtype, device=v.device) - 2 * v[..., :, None] * v[..., None, :]
-            for v in (normalize(middle, dim=-1), normal)
-        )
-        mirrored = across_sight @ found.rotations @ in_plane
-        turns, shifts = mirrored, middle - (mirrored @ centre[..., None])[..., 0]
-        few = ~starts.valid[:, 1] & ((weights > 0).sum(-1) <= _FEW_POINTS)
-        near = 2 * task.cost(torch.cat((rotation_vector(turns), shifts), -1)) <= _WORSE * found.costs
-        flat = flat & torch.isfinite(found.costs) & (few | near)
-        if bool(flat.any()):
-            found = _take_best([found, _minimum(task, turns, shifts, flat)])
+        found = _best_minimum(task)
     else:
-        rotations, translations = _consensus(task, threshold)
-        near, before = _nearby(task, rotations, translations, threshold), torch.zeros_like(weights, dtype=torch.bool)
-        lost, none = torch.full_like(weights[:, 0], torch.inf), weights.new_zeros(len(weights), 6, 7)
-        found = _Found(lost, rotations, translations, none)
-        for _ in range(8):  # choices of the near points
-            if torch.equal(near, before):
-                break
-            task = task._replace(weights=torch.where(near, weights, 0.0))
-            found = _minimum(task, found.rotations, found.translations, _are_spread(task.points, near))
-            before, near = near, _nearby(task._replace(weights=weights), found.rotations, found.translations, threshold)
-        found = found._replace(costs=torch.where((near == before).all(-1), found.costs, torch.inf))
-    # the covariance of turns and of shifts of the origin
+        found, task = _among_outliers(task, threshold)
     good = torch.isfinite(found.costs)
     inliers = (task.weights > 0) & good[:, None]
-    eye = torch.eye(6, dtype=found.costs.dtype, device=found.costs.device)
-    by = found.triangles[..., :6].square().sum(-2).sqrt()
-    inverse, failed = torch.linalg.inv_ex(found.triangles[..., :6] / torch.where(by > 0, by, 1.0)[:, None])
-    inverse = inverse / by[..., None]
-    variance = found.costs / (2 * inliers.sum(-1) - 6).clamp(min=1)
-    away, carried = (found.rotations @ task.middles[..., None])[..., 0], eye.repeat(len(good), 1, 1)
-    carried[:, 3:, :3] = skew_matrix(away)
-    carried = carried @ inverse
-    covariance = carried @ carried.mT * variance[:, None, None]
-    covariance = torch.where((good & (failed == 0))[:, None, None], covariance, torch.nan)
+    away = (found.rotations @ task.middles[..., None])[..., 0]
+    covariance = _covariance(found, inliers, away)
     rms = (found.costs / task.weights.sum(-1).clamp(min=torch.finfo(torch.float64).tiny)).sqrt()
     return Solved(rotation_vector(found.rotations), found.translations - away, rms, good, inliers, covariance)
+
+
+def _best_minimum(task: _Task) -> _Found:
+    """Return the best minima from the starts by rays, and from their mirror images."""
+    starts = poses_from_rays(task.points, task.rays, task.weights)
+    found = _take_best([_minimum(task, *(t[:, i] for t in starts)) for i in range(2)])
+    # the other minimum of points on a plane may be one for pixels and not for rays, with few points or much noise
+    turns, shifts, is_flat = _mirrored(task, found)
+    few = ~starts.valid[:, 1] & ((task.weights > 0).sum(-1) <= _FEW_POINTS)
+    near = 2 * task.cost(torch.cat((rotation_vector(turns), shifts), -1)) <= _WORSE * found.costs
+    may_be_better = is_flat & torch.isfinite(found.costs) & (few | near)
+    if not bool(may_be_better.any()):
+        return found
+    return _take_best([found, _minimum(task, turns, shifts, may_be_better)])
+
+
+def _mirrored(task: _Task, found: _Found) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the poses at which planes are mirrored across the line of sight, and whether points are flat, (B,)."""
+    share = task.weights / task.weights.sum(-1, keepdim=True)
+    centre = (share[..., None] * task.points).sum(-2)
+    about = task.points - centre[:, None]
+    variances, axes = torch.linalg.eigh(((share[..., None] * about).mT @ about).nan_to_num(0.0))
+    middle = (found.rotations @ centre[..., None])[..., 0] + found.translations
+    across_sight, in_plane = (
+        torch.eye(3, dtype=v.dtype, device=v.device) - 2 * v[..., :, None] * v[..., None, :]
+        for v in (normalize(middle, dim=-1), axes[..., 0])
+    )
+    turns = across_sight @ found.rotations @ in_plane
+    return turns, middle - (turns @ centre[..., None])[..., 0], variances[:, 0] <= _THIN**2 * variances[:, 2]
+
+
+def _among_outliers(task: _Task, threshold: float) -> tuple[_Found, _Task]:
+    """Return minima for the points near them, and the task in which only these have weights."""
+    weights = task.weights
+    rotations, translations = _consensus(task, threshold)
+    lost, none = torch.full_like(weights[:, 0], torch.inf), weights.new_zeros(len(weights), 6, 7)
+    found, before = _Found(lost, rotations, translations, none), torch.zeros_like(weights, dtype=torch.bool)
+    near = _nearby(task, rotations, translations, threshold)
+    for _ in range(8):  # choices of the near points
+        if torch.equal(near, before):
+            break
+        task = task._replace(weights=torch.where(near, weights, 0.0))
+        found = _minimum(task, found.rotations, found.translations, _are_spread(task.points, near))
+        before, near = near, _nearby(task._replace(weights=weights), found.rotations, found.translations, threshold)
+    return found._replace(costs=torch.where((near == before).all(-1), found.costs, torch.inf)), task
+
+
+def _covariance(found: _Found, inliers: Tensor, away: Tensor) -> Tensor:
+    """Return covariances (B, 6, 6) of turns, and of shifts of the origin, which is `away` (B, 3) from the middle."""
+    triangles = found.triangles[..., :6]
+    size = triangles.square().sum(-2).sqrt()
+    inverse, failed = torch.linalg.inv_ex(triangles / torch.where(size > 0, size, 1.0)[:, None])
+    inverse = inverse / size[..., None]
+    carried = torch.eye(6, dtype=size.dtype, device=size.device).repeat(len(size), 1, 1)
+    carried[:, 3:, :3] = skew_matrix(away)
+    carried = carried @ inverse
+    variance = found.costs / (2 * inliers.sum(-1) - 6).clamp(min=1)
+    covariance = carried @ carried.mT * variance[:, None, None]
+    good = torch.isfinite(found.costs) & (failed == 0)
+    return torch.where(good[:, None, None], covariance, torch.nan)
 
 
 class _Found(NamedTuple):
