@@ -93,7 +93,7 @@ class State(NamedTuple):
     """The unknowns of a search. A point of a board is at `mount(board(point))` for a camera."""
 
     parameters: tuple[Tensor, ...]  # of each camera (B, 4 + n), fx, fy, cx, cy and the coefficients
-    mounts: Poses  # of each camera, from the first one's frame; the first is the identity unless it learns
+    mounts: Poses  # of each camera, from the first one's frame; the first is the identity
     boards: Poses  # of each view
     bend: Tensor  # (B, 2), how far the board's middle lies behind its edges along x and y, see `bend_points`
 
@@ -117,7 +117,7 @@ class Free(NamedTuple):
     """The unknowns that learn."""
 
     parameters: tuple[Tensor, ...]  # of each camera (4 + n,) bool
-    mounts: tuple[bool, ...]  # of each camera
+    mounts: bool = False  # those of all cameras but the first one
     boards: str = "poses"  # or "positions" for their translations alone
     bend: bool = False  # the shape of the board
 
@@ -200,7 +200,7 @@ def minima(
 
 def adjust_poses(observed: CameraObservations, parameters: Tensor, poses: Poses, **options: Any) -> Adjusted:
     """Return the poses (K, 1) of least cost near the given ones, each a problem of its own, for a fixed camera."""
-    free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),), (False,))
+    free = Free((torch.zeros(parameters.shape[-1], dtype=torch.bool, device="cpu"),))
     return adjust([observed], State.of_one(parameters, poses), free, **options)
 
 
@@ -230,25 +230,24 @@ class Bundle:
         self.cameras = [_template(s.model, p) for s, p in zip(observed, state.parameters, strict=True)]
         self.rounding = torch.stack([rounding_of(s.pixels, s.weights) for s in self.observed]).sum(0)
         # a camera that does not learn, and is the same for all problems, projects all points as one row
-        pairs = zip(state.parameters, free.parameters, strict=True)
-        self.are_shared = [len(p) == 1 and not bool(f.any()) for p, f in pairs]
         self.fixed = [
-            remade(camera, intrinsics=p[0, :4], distortion=p[0, 4:]) if shared else None
-            for camera, p, shared in zip(self.cameras, state.parameters, self.are_shared, strict=True)
+            remade(camera, intrinsics=p[0, :4], distortion=p[0, 4:]) if len(p) == 1 and not bool(f.any()) else None
+            for camera, p, f in zip(self.cameras, state.parameters, free.parameters, strict=True)
         ]
-        self.columns = tuple(
-            [(c, int(i)) for c, f in enumerate(free.parameters) for i in f.nonzero()[:, 0]]
-            + [(c, len(free.parameters[c]) + i) for c, learns in enumerate(free.mounts) if learns for i in range(6)]
-            + [(-1, i) for i in range(2) if free.bend]
-        )
-        # for each camera, the places of its parameters among the columns, and their indices; the places of its mount
         counts = [p.shape[-1] for p in state.parameters]
+        columns = [(c, i) for c, f in enumerate(free.parameters) for i in f.nonzero()[:, 0].tolist()]
+        if free.mounts:
+            columns += [(c, count + i) for c, count in enumerate(counts) if c > 0 for i in range(6)]
+        if free.bend:
+            columns += [(-1, 0), (-1, 1)]
+        self.columns = tuple(columns)
+        # for each camera, the places of its parameters among the columns, and their indices; the places of its mount
         self.learnt = [places_of(self.columns, c, range(count)) for c, count in enumerate(counts)]
         self.mounted = [places_of(self.columns, c, range(count, count + 6))[0] for c, count in enumerate(counts)]
         self.is_bent = free.bend or bool((state.bend != 0).any())
         # native code knows one camera that sees flat boards at unknown poses
-        plain = len(observed) == 1 and free.boards == "poses" and not (free.mounts[0] or self.is_bent)
-        self.is_plain = plain and native_forms(self.cameras, self.observed[0].pixels) is not None
+        is_plain = len(observed) == 1 and free.boards == "poses" and not self.is_bent
+        self.is_compiled = is_plain and native_forms(self.cameras, self.observed[0].pixels) is not None
         self.width = 6 if free.boards == "poses" else 3  # of the unknowns of a view
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.observed]).any(0).sum()
         self.unknowns = len(self.columns) + self.width * int(views)
@@ -278,7 +277,7 @@ class Bundle:
         points = bend_points(observed.points, state.bend)[0] if self.is_bent else observed.points
         turned = points @ state.boards.rotations.mT
         first = turned + state.boards.translations[:, :, None]
-        if c == 0 and not self.free.mounts[0]:
+        if c == 0:
             return turned, first, first
         mounts = state.mounts
         return turned, first, first @ mounts.rotations[:, c, None].mT + mounts.translations[:, c, None, None]
@@ -290,15 +289,8 @@ class Bundle:
     def errors_of(self, c: int, flat: Sequence[Tensor], rows: Tensor) -> Errors:
         """Return residuals, validity, weights and costs of a camera at a state."""
         state, observed = self.state(flat), self.observed_by(c, rows)
-        if self.is_plain and len(state.bend):
-            parameters = state.parameters[0][: 1 if self.are_shared[0] else None]
-            native = CameraRows(type(self.cameras[0]), parameters[:, :4], parameters[:, 4:]).native
-            assert native is not None  # the first cameras had it
-            own = self.learnt[0][1]
-            has_triangles = native.plan.places is not None or all(i < 4 for i in own)
-            given = observed.points, state.boards, observed.pixels, observed.weights, self.loss
-            # triangles for the next step, which begins here unless this one is rejected
-            return project_views(native, *given, own if has_triangles else None)
+        if self.is_compiled and len(rows):
+            return self._compiled_errors(state, observed)
         pixels, valid = self.camera(c, state).project(self.points(c, state, observed)[-1])
         residuals = torch.where((valid & (observed.weights > 0))[..., None], pixels - observed.pixels, 0.0)
         u, v = residuals.unbind(-1)
@@ -306,6 +298,16 @@ class Bundle:
         lost, _ = self.loss.of(cost.new_tensor(LOST**2))
         cost = (torch.where(valid, cost, lost) * observed.weights).sum(-1)
         return Errors(residuals, valid, torch.where(valid, slope * observed.weights, 0.0), cost)
+
+    def _compiled_errors(self, state: State, observed: CameraObservations) -> Errors:
+        (parameters,), (_, own) = state.parameters, self.learnt[0]
+        parameters = parameters if self.fixed[0] is None else parameters[:1]
+        native = CameraRows(type(self.cameras[0]), parameters[:, :4], parameters[:, 4:]).native
+        assert native is not None  # the first cameras had it
+        has_triangles = native.plan.places is not None or all(i < 4 for i in own)
+        given = observed.points, state.boards, observed.pixels, observed.weights, self.loss
+        # triangles for the next step, which begins here unless this one is rejected
+        return project_views(native, *given, own if has_triangles else None)
 
     def all_errors(self, flat: Sequence[Tensor], rows: Tensor) -> list[Errors]:
         """Return the errors of all cameras; the last ones are reused if the state is the same."""
@@ -359,10 +361,7 @@ class Bundle:
             return Equations(view, shared, self.columns)
         for c, errors in enumerate(by_camera):
             block, at = self.rows_of(c, errors, state, rows)
-            if total == 0:
-                parts.append(block)
-                continue
-            if len(self.observed) > 1:  # a triangle has fewer rows to spread over the columns of all cameras
+            if total and len(self.observed) > 1:  # a triangle has fewer rows to spread over the columns of all cameras
                 block = torch.linalg.qr(block, mode="r").R
                 whole = block.new_zeros(*block.shape[:-1], width + total + 1)
                 whole[..., [*range(width), *(width + g for g in at), width + total]] = block
@@ -394,19 +393,18 @@ class Bundle:
         observed = self.observed_by(c, rows)
         turned, first, points = self.points(c, state, observed)
         batch, views, count = points.shape[:3]
-        lead = (1, batch * views * count) if self.are_shared[c] else (batch, views * count)
+        lead = (batch, views * count) if self.fixed[c] is None else (1, batch * views * count)
         places, own = self.learnt[c]
         found = pixel_jacobians(self.camera(c, state), points.reshape(*lead, 3), bool(own))
         by_point, by_parameters = (by.reshape(batch, views, count, 2, by.shape[-1]) for by in found)
-        is_mounted = c > 0 or self.free.mounts[0]
-        by_first = by_point @ state.mounts.rotations[:, c, None, None] if is_mounted else by_point
+        by_first = by_point if c == 0 else by_point @ state.mounts.rotations[:, c, None, None]
         columns = []
         if self.width == 6:
             columns.append(torch.linalg.cross(turned[..., None, :].expand_as(by_first), by_first, dim=-1))
         columns.append(by_first)
         if own:
             columns.append(by_parameters[..., own])
-        if self.free.mounts[c]:
+        if self.mounted[c]:
             turned = first @ state.mounts.rotations[:, c, None].mT
             columns += [torch.linalg.cross(turned[..., None, :].expand_as(by_point), by_point, dim=-1), by_point]
         bend, _ = places_of(self.columns, -1, range(2))
@@ -435,7 +433,7 @@ class Bundle:
             parameters.append(p)
         if self.free.bend:
             bend = bend + shared[:, -2:]
-        if any(self.free.mounts):
+        if self.free.mounts:
             turn, shift = torch.zeros_like(mounts.translations), torch.zeros_like(mounts.translations)
             for c, places in enumerate(self.mounted):
                 if places:
@@ -445,6 +443,7 @@ class Bundle:
 
 
 def _of_rows(values: Tensor, rows: Tensor) -> Tensor:
+    """Return the values of some problems; nothing is copied for all of them."""
     return values if len(rows) == len(values) else values[rows]
 
 

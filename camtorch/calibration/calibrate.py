@@ -196,7 +196,7 @@ class Search:
 
     def free(self, bend: bool = False) -> Free:
         """Return the unknowns of a search for this camera alone; `bend` adds the board's shape."""
-        return Free((self.asked.free.to(self.seen.pixels.device),), (False,), bend=bend)
+        return Free((self.asked.free.to(self.seen.pixels.device),), bend=bend)
 
     def alone(self, bend: bool = False) -> Adjusted:
         """Return the optimum for this camera's views; poses are searched again and kept if they fit it better."""

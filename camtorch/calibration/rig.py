@@ -144,7 +144,7 @@ def calibrate_rig(
         searches.append(Search(of, asked, seen, middle, robust))
     observed = [search.observed for search in searches]
     learns = tuple(parameters for search in searches for parameters in search.free().parameters)
-    free = Free(learns, tuple(c > 0 for c in range(len(searches))), bend=bend)
+    free = Free(learns, mounts=True, bend=bend)
     adjusted = adjust(observed, _join_starts(searches, observed, free), free, loss=robust, steps=STEPS)
     found = results(searches, adjusted, free)
     cameras, state = dict(zip(by_name, found.cameras, strict=True)), found.adjusted.state
@@ -188,17 +188,33 @@ def _join_starts(searches: list[Search], observed: list[CameraObservations], fre
         boards = Poses.none(1, len(has), search.seen.pixels).with_views(has.nonzero()[:, 0], state.boards)
         states.append(state._replace(boards=boards))
     parameters = tuple(state.parameters[0] for state in states)
-    mounts = Poses.none(1, len(states), parameters[0])
+    mounts = _join_mounts([state.boards for state in states], has_pose)
+    boards, least = states[0].boards, torch.full_like(states[0].boards.translations[0, :, 0], torch.inf)
+    for c, one in enumerate(states):
+        turn, shift = (t[0, c] for t in mounts)
+        own = Poses(turn.mT @ one.boards.rotations, (one.boards.translations - shift) @ turn)
+        state = State(parameters, mounts, own, own.translations.new_zeros(1, 2))
+        bundle = Bundle(observed, state, free, Loss("cauchy"))
+        cost = torch.stack([errors.cost[0] for errors in bundle.all_errors(bundle.flat(state), bundle.every)]).sum(0)
+        better = has_pose[c] & (cost < least)
+        least = torch.where(better, cost, least)
+        boards = Poses.where(better, own, boards)
+    return State(parameters, mounts, boards, least.new_zeros(1, 2))
+
+
+def _join_mounts(boards: list[Poses], has_pose: list[Tensor]) -> Poses:
+    """Return the mounts (1, C) of cameras by their poses of boards (1, V), one after the other from the first on."""
+    mounts = Poses.none(1, len(boards), boards[0].translations)
     turns, shifts = mounts.rotations[0], mounts.translations[0]
     together = torch.stack(has_pose).double()
-    together = together @ together.mT
+    together = together @ together.mT  # (C, C), the number of boards that two cameras see
     known = [0]
-    while len(known) < len(states):
-        rest = [c for c in range(len(states)) if c not in known]
+    while len(known) < len(boards):
+        rest = [c for c in range(len(boards)) if c not in known]
         i, j = divmod(int(together[known][:, rest].argmax()), len(rest))
         a, b = known[i], rest[j]
         both = has_pose[a] & has_pose[b]
-        (from_a, at_a), (from_b, at_b) = ((t[0, both] for t in states[c].boards) for c in (a, b))
+        (from_a, at_a), (from_b, at_b) = ((t[0, both] for t in boards[c]) for c in (a, b))
         # from camera a to b: of all boards' poses, the one nearest to the others
         rotations = from_b @ from_a.mT
         translations = at_b - (rotations @ at_a[..., None])[..., 0]
@@ -209,13 +225,4 @@ def _join_starts(searches: list[Search], observed: list[CameraObservations], fre
         turns[b] = rotations[middle] @ turns[a]
         shifts[b] = rotations[middle] @ shifts[a] + translations[middle]
         known.append(b)
-    boards, least = states[0].boards, torch.full_like(states[0].boards.translations[0, :, 0], torch.inf)
-    for c, one in enumerate(states):
-        own = Poses(turns[c].mT @ one.boards.rotations, (one.boards.translations - shifts[c]) @ turns[c])
-        state = State(parameters, mounts, own, own.translations.new_zeros(1, 2))
-        bundle = Bundle(observed, state, free, Loss("cauchy"))
-        cost = torch.stack([errors.cost[0] for errors in bundle.all_errors(bundle.flat(state), bundle.every)]).sum(0)
-        better = has_pose[c] & (cost < least)
-        least = torch.where(better, cost, least)
-        boards = Poses.where(better, own, boards)
-    return State(parameters, mounts, boards, least.new_zeros(1, 2))
+    return mounts

@@ -183,7 +183,7 @@ def _free_parameters(model: type[Camera], count: int, fixed: Collection[str]) ->
     """Return the parameters that learn: all except those held by `fixed` or by the model."""
     names = (*INTRINSICS, *(model.names_of(count) or ()))
     learns = [name not in fixed and model.fit_bounds.get(name, ()) is not None for name in names]
-    return Free((torch.tensor(learns, device="cpu"),), (False,))
+    return Free((torch.tensor(learns, device="cpu"),))
 
 
 def _subsample(observations: Observations) -> Observations:

@@ -170,7 +170,7 @@ def _solve(task: _Task, rays: Tensor) -> tuple[Tensor, Tensor]:
     seen_by = zip(map(model_of, task.cameras), pixels[..., None, None, :], seen[..., None, None], strict=True)
     observed = [CameraObservations(model, start.new_zeros(count, 1, 1, 3), *rest) for model, *rest in seen_by]
     held = tuple(torch.zeros(p.shape[-1], dtype=torch.bool, device=p.device) for p in parameters)
-    free = Free(held, (False,) * len(observed), "positions")
+    free = Free(held, boards="positions")
     found = adjust(
         observed, state, free, steps=_STEPS, settled=_SETTLED, nothing=_NOTHING, damping=_DAMPING, going=views >= 2
     )

@@ -74,30 +74,19 @@ class System:
     def step(self, damping: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """Return steps of the views (R, V, L) and of shared unknowns (R, G), and the linear cost's decrease (R,)."""
         view, shared, width = self.equations.view, self.equations.shared, self.width
-        if (
-            library() is not None
-            and shared.is_cpu
-            and shared.dtype == torch.float64
-            and shared.shape[-1] <= _FEW_UNKNOWNS
-        ):
+        is_usual = shared.is_cpu and shared.dtype == torch.float64 and shared.shape[-1] <= _FEW_UNKNOWNS
+        if is_usual and library() is not None:
             return self._compiled_step(damping)
-        squares = view[..., :-1].square().sum(-2)
-        root = damping.sqrt()
+        squares, root = view[..., :-1].square().sum(-2), damping.sqrt()
         rest = shared.shape[-1] - 1
-        if width:
-            scale = squares[..., :width].sqrt()
-            scale = torch.where(scale > 0, scale, 1.0) * root[:, None, None]
-            damped = torch.cat((torch.diag_embed(scale), view.new_zeros(*scale.shape, rest + 1)), -1)
-            if rest:
-                view = torch.linalg.qr(torch.cat((view, damped), -2), mode="r").R
-                left = view[..., width:, width:].flatten(1, 2)
-                view = view[..., :width, :]
-            else:
-                view = triangle_of_few(torch.cat((view, damped), -2))
-                left = view.new_zeros(len(view), 0, 1)
-        else:
-            left = view.new_zeros(len(view), 0, rest + 1)
+        scale = squares[..., :width].sqrt()
+        scale = torch.where(scale > 0, scale, 1.0) * root[:, None, None]
+        damped = torch.cat((torch.diag_embed(scale), view.new_zeros(*scale.shape, rest + 1)), -1)
+        rows = torch.cat((view, damped), -2)
         if rest:
+            view = torch.linalg.qr(rows, mode="r").R
+            left = view[..., width:, width:].flatten(1, 2)
+            view = view[..., :width, :]
             scale = (squares[..., width:].sum(1) + shared[:, :-1, :-1].square().sum(-2)).sqrt()
             scale = torch.where(scale > 0, scale, 1.0)
             damped = torch.nn.functional.pad(torch.diag_embed(root[:, None].expand_as(scale)), (0, 1))
@@ -106,12 +95,9 @@ class System:
             triangle = torch.linalg.qr(torch.cat((shared / by, left / by, damped), 1), mode="r").R
             whole = -_solve(triangle[:, :rest, :rest], triangle[:, :rest, -1:])[..., 0] / scale
         else:
-            whole = shared.new_zeros(len(shared), 0)
-        if width:
-            right = view[..., -1:] + view[..., width:-1] @ whole[:, None, :, None]
-            of_views = -_solve(view[..., :width], right)[..., 0]
-        else:
-            of_views = view.new_zeros(*view.shape[:2], 0)
+            view, whole = triangle_of_few(rows), shared.new_zeros(len(shared), 0)
+        right = view[..., -1:] + view[..., width:-1] @ whole[:, None, :, None]
+        of_views = -_solve(view[..., :width], right)[..., 0]
         fine = torch.isfinite(whole).all(-1) & torch.isfinite(of_views).all(-1).all(-1)
         of_views, whole = torch.where(fine[:, None, None], of_views, 0.0), torch.where(fine[:, None], whole, 0.0)
         # the part of the decrement that remains after the step

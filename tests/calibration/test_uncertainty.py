@@ -46,7 +46,7 @@ class Problem:
     def free(self, *fixed, **more):
         names = [("fx", "fy", "cx", "cy", *camera.distortion_names) for camera in self.cameras]
         learns = tuple(torch.tensor([name not in fixed for name in of_one]) for of_one in names)
-        return Free(learns, tuple(i > 0 for i in range(len(self.cameras))), **more)
+        return Free(learns, mounts=True, **more)
 
     def observed(self, batch=1, noise=NOISE):
         draw, observed, shape = torch.Generator().manual_seed(0), [], (1, *self.seen[0].shape, 3)
