@@ -13,7 +13,8 @@ os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")  # its import asks a serv
 def pytest_collection(session):
     """Prepare torch and hypothesis in each process that runs tests, before it imports them.
 
-    Imported modules and tests stay: the garbage collector need not look at them, again and again.
+    Imported modules and tests stay: the garbage collector need not look at them, again and again, nor after every 700
+    objects at what a test holds.
     """
     if session.config.pluginmanager.hasplugin("dsession"):  # xdist's own process waits for the others
         return (yield)
@@ -32,6 +33,7 @@ def pytest_collection(session):
     settings.load_profile("camtorch")
     collected = yield
     gc.freeze()
+    gc.set_threshold(50_000)
     gc.enable()
     return collected
 
@@ -49,7 +51,7 @@ def _random_numbers_are_the_same():
 
     random.seed(0)
     np.random.seed(0)
-    torch.manual_seed(0)
+    torch.default_generator.manual_seed(0)  # torch.manual_seed asks every kind of device, which takes a millisecond
 
 
 @pytest.fixture(autouse=True)

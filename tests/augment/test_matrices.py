@@ -2,9 +2,9 @@
 
 import copy
 import importlib
-import logging
 import pickle
 import re
+import unittest
 
 import numpy as np
 import pytest
@@ -270,13 +270,13 @@ def test_a_number_takes_the_place_of_a_camera():
             assert float(one(**sample)["camera"].fov[0]) == pytest.approx(90)
 
 
-def test_a_guess_is_told_once(caplog):
+def test_a_guess_is_told_once():
     TOLD.clear()
     matrices._guessed.cache_clear()
-    with caplog.at_level(logging.INFO, logger="camtorch"):
+    with unittest.TestCase().assertLogs("camtorch", "INFO") as logs:
         for size in (SIZE, (50, 60)):
             A.RandomMount(camera=60)(image=torch.rand(3, *size))
-    assert [re.match("cameras are guessed", record.message) is not None for record in caplog.records] == [True]
+    assert [re.match("cameras are guessed", record.getMessage()) is not None for record in logs.records] == [True]
 
 
 @pytest.mark.parametrize("value", [0, 180, -60, 1.0, float("nan"), True, "60"])
