@@ -7,16 +7,16 @@ CMake to a library of two files.
 And it makes the README one that an index of packages can show: there its links have no repository around them.
 """
 
-import importlib.util
 import os
 import platform
 import re
+import runpy
 import sys
 import sysconfig
 import tempfile
 from contextlib import suppress
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
@@ -44,7 +44,8 @@ class NativeSampler(BuildHookInterface):
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compile, and say what else the wheel holds and what it runs on."""
         native = Path(self.root, "camtorch", "native")
-        building = _module(native / "build.py")
+        # by its path, as its package may not be importable here
+        building = SimpleNamespace(**runpy.run_path(str(native / "build.py")))
         # as an attribute: it is there until the wheel is written, and gone after
         self.folder = tempfile.TemporaryDirectory()
         folder = native if version == "editable" else Path(self.folder.name)
@@ -67,16 +68,6 @@ class NativeSampler(BuildHookInterface):
         if held == library:
             build_data["pure_python"] = False
             build_data["tag"] = f"py3-none-{_platform()}"
-
-
-def _module(path: Path) -> ModuleType:
-    """The module in this file; its package may not be importable here, and needs no import."""
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def _line(text: str) -> str:

@@ -45,9 +45,9 @@ the crop, after the best shift, turn and scale.
 """
 
 import argparse
-import importlib.util
 import json
 import math
+import runpy
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -405,14 +405,11 @@ def study(predict: Predict, things: Sequence[Photograph], lens: ct.Camera) -> Re
 
 def loaded(path: str) -> Predict:
     """Return the function `predict` of a file."""
-    spec = importlib.util.spec_from_file_location("predict", path)
-    if spec is None or spec.loader is None or not Path(path).is_file():
+    if not Path(path).is_file():
         raise FileNotFoundError(f"stress_test: predict must be a Python file with a function predict; got {path!r}")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    if not callable(found := getattr(module, "predict", None)):
+    predict: Predict | None = runpy.run_path(path).get("predict")
+    if not callable(predict):
         raise ValueError(f"stress_test: {path} must have a function predict(images); it has none")
-    predict: Predict = found
     return predict
 
 

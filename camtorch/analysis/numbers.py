@@ -80,12 +80,6 @@ def difference(a: Camera, b: Camera, *, remove_rotation: bool = False) -> Differ
     return Difference(torch.linalg.vector_norm(others.double() - pixels, dim=-1), seen & shown, turn)
 
 
-def angle(rotation: Tensor) -> float:
-    """Return the angle of a rotation matrix (3, 3) in radians."""
-    sine = torch.linalg.matrix_norm(rotation - rotation.mT) / math.sqrt(8)
-    return math.atan2(float(sine), (float(rotation.trace()) - 1) / 2)
-
-
 @dataclass
 class Summary:
     """Numbers of a single camera; those of the image are None for a camera without image size."""

@@ -118,8 +118,12 @@ class Splined(Camera):
         return torch.cat([part.flatten(0, 2) for part in parts])
 
     @classmethod
+    @cache
     def model_for_search(cls) -> type[Camera]:
-        return _model_for_search(cls)  # type: ignore[arg-type]  # a class can be hashed
+        # the outermost pieces are longer, as corners at the edge would block the search
+        optics = _optics_of(cls.order, cls.columns, cls.rows, cls.fov_x, behind=1.0)
+        named = {"__module__": Camera.__module__, "__qualname__": f"{cls.key}:searched", "__doc__": cls.__doc__}
+        return type("Splined", (cls,), {**named, "optics": staticmethod(optics)})
 
     def extra_repr(self) -> str:
         """Return the fields with the grid instead of its control points."""
@@ -144,14 +148,6 @@ def _optics_of(
         return StereographicUpTo(last), Lens(surface)
 
     return optics
-
-
-@cache
-def _model_for_search(kind: type[Splined]) -> type[Splined]:
-    """Return the class for a search, with longer outermost pieces: otherwise corners at the edge would block it."""
-    optics = _optics_of(kind.order, kind.columns, kind.rows, kind.fov_x, behind=1.0)
-    named = {"__module__": Camera.__module__, "__qualname__": f"{kind.key}:searched", "__doc__": kind.__doc__}
-    return type("Splined", (kind,), {**named, "optics": staticmethod(optics)})
 
 
 def _of_grid(order: int, columns: int, rows: int, fov_x: int) -> dict[str, Any]:

@@ -99,7 +99,7 @@ def structs_py(folder: Path = _HERE) -> str:
     found = read(folder)
     lines = [_HEAD, f"CHECKSUM = {found.checksum}", "", *(f"{name} = {value}" for name, value in found.values.items())]
     for struct, fields in found.structs.items():
-        lines += ["", "", f"class {struct}(Struct):", f'    """`{struct}` of the headers."""', "", "    __slots__ = ()"]
+        lines += ["", "", f"class {struct}(Struct):", "    __slots__ = ()"]
         for name, (kind, many) in fields.items():
             one, in_c = _FIELDS.get(kind, (kind, kind))
             hint = f"Annotated[Numbers, {in_c} * {many}]" if many else one

@@ -136,8 +136,6 @@ CAUCHY = 2
 
 
 class Agreement(Struct):
-    """`Agreement` of the headers."""
-
     __slots__ = ()
     points: Pointer
     measures: Pointer
@@ -156,8 +154,6 @@ class Agreement(Struct):
 
 
 class Job(Struct):
-    """`Job` of the headers."""
-
     __slots__ = ()
     source: Pointer
     result: Pointer
@@ -192,8 +188,6 @@ class Job(Struct):
 
 
 class Images(Struct):
-    """`Images` of the headers."""
-
     __slots__ = ()
     jobs: Pointer
     count: Int64
@@ -201,8 +195,6 @@ class Images(Struct):
 
 
 class Classification(Struct):
-    """`Classification` of the headers."""
-
     __slots__ = ()
     nodes: Pointer
     node_strides: Annotated[Numbers, c_int64 * 2]
@@ -224,8 +216,6 @@ class Classification(Struct):
 
 
 class Laying(Struct):
-    """`Laying` of the headers."""
-
     __slots__ = ()
     nodes: Pointer
     cells: Pointer
@@ -243,8 +233,6 @@ class Laying(Struct):
 
 
 class Part(Struct):
-    """`Part` of the headers."""
-
     __slots__ = ()
     kind: Int32
     flags: Int32
@@ -257,8 +245,6 @@ class Part(Struct):
 
 
 class Cameras(Struct):
-    """`Cameras` of the headers."""
-
     __slots__ = ()
     parts: Pointer
     part_count: Int64
@@ -283,8 +269,6 @@ class Cameras(Struct):
 
 
 class Domain(Struct):
-    """`Domain` of the headers."""
-
     __slots__ = ()
     parts: Pointer
     part_count: Int64
@@ -313,8 +297,6 @@ class Domain(Struct):
 
 
 class Rows(Struct):
-    """`Rows` of the headers."""
-
     __slots__ = ()
     cameras: Pointer
     rows: Pointer
@@ -333,8 +315,6 @@ class Rows(Struct):
 
 
 class Move(Struct):
-    """`Move` of the headers."""
-
     __slots__ = ()
     from_: Pointer
     to: Pointer
@@ -355,8 +335,6 @@ class Move(Struct):
 
 
 class Lattices(Struct):
-    """`Lattices` of the headers."""
-
     __slots__ = ()
     move: Move
     cells: Classification
@@ -370,8 +348,6 @@ class Lattices(Struct):
 
 
 class Turned(Struct):
-    """`Turned` of the headers."""
-
     __slots__ = ()
     turn: Pointer
     rows: Pointer
@@ -383,8 +359,6 @@ class Turned(Struct):
 
 
 class Together(Struct):
-    """`Together` of the headers."""
-
     __slots__ = ()
     jobs: Pointer
     job_count: Int64
@@ -397,8 +371,6 @@ class Together(Struct):
 
 
 class Draws(Struct):
-    """`Draws` of the headers."""
-
     __slots__ = ()
     values: Pointer
     first: Annotated[Numbers, c_int64 * 10]
@@ -434,8 +406,6 @@ class Draws(Struct):
 
 
 class Poses(Struct):
-    """`Poses` of the headers."""
-
     __slots__ = ()
     cameras: Pointer
     points: Pointer
@@ -466,8 +436,6 @@ class Poses(Struct):
 
 
 class Views(Struct):
-    """`Views` of the headers."""
-
     __slots__ = ()
     cameras: Pointer
     points: Pointer
@@ -493,8 +461,6 @@ class Views(Struct):
 
 
 class Steps(Struct):
-    """`Steps` of the headers."""
-
     __slots__ = ()
     view: Pointer
     shared: Pointer

@@ -15,7 +15,7 @@ from camtorch.calibration.rig import RigCalibration
 from camtorch.calibration.verdict import Calibration
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
-from camtorch.poses.rotations import rotation_matrix
+from camtorch.poses.rotations import rotation_matrix, rotation_vector
 from camtorch.rays.lattices import angles_from_axis, followed, ideal, image_lattice
 from camtorch.values.arguments import imported
 
@@ -144,7 +144,7 @@ def difference(a: Camera, b: Camera, ax: Axes | None = None, *, remove_rotation:
     ax.set_facecolor(NO_RAYS)
     image = ax.imshow(values, extent=draw_frame(ax, height, width), cmap="magma_r", interpolation="nearest")
     _bar(ax, image, compared.apart[compared.both])
-    degrees = math.degrees(numbers.angle(compared.rotation))
+    degrees = math.degrees(rotation_vector(compared.rotation).norm())
     turned = f", turned by {degrees:.3g} degrees" if remove_rotation else ""
     ax.set_title(f"{a.key} and {b.key}: {compared}{turned}")
     return ax

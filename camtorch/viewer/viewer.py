@@ -176,4 +176,4 @@ def _lenses() -> dict[str, Any]:
 
 def _deflate(content: bytes) -> str:
     """Return raw Deflate as Base64, which browsers can decode."""
-    return base64.b64encode(zlib.compress(content, 9)[2:-4]).decode()
+    return base64.b64encode(zlib.compress(content, 9, wbits=-zlib.MAX_WBITS)).decode()
