@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.camera import Camera
+from camtorch.poses.rotations import rotation_matrix
 from scenes import driver, landmarks
 from scenes.driver import FRIENDLY, LOOKS
 from scenes.exposure import corner_rays, in_strips, lattice
@@ -95,12 +96,7 @@ def random_drivers(count: int, generator: torch.Generator | None = None, *, spre
 
 def _turn(angle: Tensor, axis: int) -> Tensor:
     """(B, 3, 3): rotations about a coordinate axis."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrix = torch.eye(3, dtype=torch.float64).repeat(len(angle), 1, 1)
-    matrix[:, i, i] = matrix[:, j, j] = angle.cos()
-    matrix[:, j, i] = angle.sin()
-    matrix[:, i, j] = -angle.sin()
-    return matrix
+    return rotation_matrix(angle[:, None] * torch.eye(3, dtype=angle.dtype)[axis])
 
 
 # -- images

@@ -3,8 +3,6 @@
 Convention: that of `cabin`; positions and rays are planes (x, y, z) of N values, colours are linear light, (3, N).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

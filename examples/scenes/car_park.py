@@ -3,8 +3,6 @@
 Convention: the ground is z = 0 in metres, x to the car's right, y ahead, z up; the car's middle is at the origin.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

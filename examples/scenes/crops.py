@@ -1,7 +1,5 @@
 """Crops of faces for networks to learn from: as taken, by `ct.augment`, by kornia, and by cameras that look at them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -5,8 +5,6 @@ head faces the camera (the person's left), y down, z into the head, in metres; a
 frame has the camera's axes and its origin at the base of the neck. Positions are planes (x, y, z) of N values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 

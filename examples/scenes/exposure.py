@@ -1,7 +1,5 @@
 """Images of scenes that are formulas: the mean of what several rays of a pixel see."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Landmarks of the face of the driver in `cabin`; positions are in the frame of the head, see `driver`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -3,8 +3,6 @@
 Convention: positions are those of `driver`; colours are linear light, (3, N) or (3, 1).
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """One driver, close by, with everything that is known of him."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

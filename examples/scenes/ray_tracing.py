@@ -3,8 +3,6 @@
 Convention: that of `cabin`; rays are unit vectors from the camera.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """A small network that reads faces: where landmarks are, and which way the eyes look."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor, nn

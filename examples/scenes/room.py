@@ -4,8 +4,6 @@ Convention: the room's frame is x right, y down, z forward, in metres; cameras s
 otherwise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any
 

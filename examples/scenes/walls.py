@@ -3,8 +3,6 @@
 Convention: x right, y down, z forward, in metres. Colours are linear light, (3, N) or (3, 1).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
