@@ -91,7 +91,3 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, nargs=0, help="show what is installed and exit")
     commands.add_all(parser.add_subparsers(title="commands", dest="command", required=True, metavar="COMMAND"))
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -71,8 +71,7 @@ class Mover:
         """Return the changed fields of a row of arrays or lists: moved fields, their validity, `rotation`, `camera`."""
         try:
             moving = {name: value for name, value in row.items() if self._moves(name, value)}
-            kinds = {name: kind_of(name, value, self._fields, self._owner) or "" for name, value in moving.items()}
-            fields = {name: _dense(name, value, kinds[name]) for name, value in moving.items()}
+            fields = {name: _dense(name, value, self._kind(name, value)) for name, value in moving.items()}
             if (camera := row.get("camera")) is not None:
                 fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)
             if self._seeded is None:
@@ -87,19 +86,23 @@ class Mover:
         """Whether a value is a field that moves, or the validity of one."""
         if name == "camera" or value is None:
             return False
-        return name.endswith("_valid") or kind_of(name, value, self._fields, self._owner) is not None
+        return name.endswith("_valid") or self._kind(name, value) is not None
+
+    def _kind(self, name: str, value: object) -> str | None:
+        return kind_of(name, value, self._fields, self._owner)
 
     def _camera(self, parts: Mapping[str, Any], fields: Sample) -> Camera:
         """Return the camera of its numbers, with the size of an image if it has none."""
         if parts.get("image_size") is None:
-            images = (v for n, v in fields.items() if kind_of(n, v, self._fields, self._owner) in IMAGES)
-            parts = {**parts, "image_size": next((v.shape[:2] for v in images if np.ndim(v) in (2, 3)), None)}
+            images = [value for name, value in fields.items() if self._kind(name, value) in IMAGES]
+            sizes = [image.shape[:2] for image in images if np.ndim(image) in (2, 3)]
+            parts = {**parts, "image_size": sizes[0] if sizes else None}
         if missing := [part for part in ("model", "intrinsics", "image_size") if parts.get(part) is None]:
             raise ValueError(f"the camera must have {', '.join(missing)}; got none. ct.data.to_columns makes all")
         return camera_of({part: _dense(part, value) for part, value in parts.items()}, self._owner)
 
 
-def _dense(name: str, value: Any, kind: str = "") -> Any:
+def _dense(name: str, value: Any, kind: str | None = None) -> Any:
     """Return lists, or arrays in an array of objects, as an array of numbers, or of bool for validity."""
     if isinstance(value, list):
         try:

@@ -89,11 +89,6 @@ class Seeded:
         self._numbers = torch.tensor([_number(seed, "seed"), _number(epoch, "epoch")]).share_memory_()
 
     @property
-    def _inner(self) -> Augmentation:
-        own = self.augmentation
-        return cast("Augmentation", own.augmentation) if isinstance(own, Transform) else own
-
-    @property
     def seed(self) -> int:
         """Seed of the whole run."""
         return int(self._numbers[0])
@@ -113,8 +108,11 @@ class Seeded:
 
     def draw(self, keys: Sequence[Key] | Tensor | np.ndarray[Any, Any]) -> dict[str, Tensor]:
         """Return the draws of a batch of samples, each drawn alone with `augmentation.draw`."""
-        if not (draws := [self._inner.draw(1, self.generator(key)) for key in keys]):
-            return self._inner.draw(0)
+        own = self.augmentation
+        inner = cast("Augmentation", own.augmentation) if isinstance(own, Transform) else own
+        draws = [inner.draw(1, self.generator(key)) for key in keys]
+        if not draws:
+            return inner.draw(0)
         return {name: torch.cat([draw[name] for draw in draws]) for name in draws[0]}
 
     def __call__(

@@ -35,13 +35,14 @@ def parse(record: Record) -> Rig:
         projection = entry["Projection"]
         key, focals, count = _MODELS[one_of(projection["Name"], _MODELS)]
         values = projection["Params"].numbers(focals + 2 + count)
-        intrinsics = values[:1] * (2 - focals) + values[: focals + 2]
-        distortion = values[focals + 2 :] or [0.0] * 4 * (key == "kannala_brandt")
+        if focals == 1:  # of both directions
+            values = [values[0], *values]
+        distortion = [0.0] * 4 if projection["Name"].value == "Spherical" else values[4:]
         size = None
         config = entry.get("ConfigData")
         if config is not None and "ImageWidth" in config:
             size = config["ImageHeight"].side(), config["ImageWidth"].side()
-        cameras[name] = projection.camera(key, intrinsics, distortion, size)
+        cameras[name] = projection.camera(key, values[:4], distortion, size)
         if "T_Device_Camera" in entry:
             place = entry["T_Device_Camera"]
             if len(quaternion := place["UnitQuaternion"]) != 2:

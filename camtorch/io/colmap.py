@@ -82,9 +82,8 @@ def _is_binary(path: str, content: bytes) -> bool:
 def read(path: str, content: bytes) -> Rig:
     """Return the cameras by their ids, and the poses of the images in the same folder by the names of the images."""
     cameras: dict[str, Camera] = {}
-    for record, identity, name, size, values in (_from_bytes if _is_binary(path, content) else _from_text)(
-        path, content
-    ):
+    entries = _from_bytes(path, content) if _is_binary(path, content) else _from_text(path, content)
+    for record, identity, name, size, values in entries:
         _, key, focals, _ = _MODELS[name]
         if str(identity) in cameras:
             record.fail(f"camera ids must be unique; got {identity} twice")

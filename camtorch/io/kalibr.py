@@ -58,10 +58,9 @@ def _camera(record: Record) -> Camera:
 
 
 def _extrinsics(record: Record, names: list[str]) -> dict[str, Extrinsics]:
-    if any("T_cam_imu" in record[name] for name in names):
-        return {name: _pose(record[name]["T_cam_imu"]) for name in names}
-    if any("T_imu_cam" in record[name] for name in names):
-        return {name: _pose(record[name]["T_imu_cam"], undo=True) for name in names}
+    for key, undo in (("T_cam_imu", False), ("T_imu_cam", True)):
+        if any(key in record[name] for name in names):
+            return {name: _pose(record[name][key], undo) for name in names}
     if not any("T_cn_cnm1" in record[name] for name in names[1:]):
         return {}
     chain = {names[0]: poses.pose(record, [0.0] * 3, [0.0] * 3)}

@@ -93,9 +93,8 @@ def prior_of(
     def rank(prior: Prior) -> tuple[int, float]:
         """Prefer most effective coefficients (the omega of `FOV` has none at 0), then the first, then strong ones."""
         scales = prior.scales(torch.tensor(prior.discs, dtype=torch.float64))
-        return -int((scales > 0).all(0).sum()), -1.0 if prior is found[0] or not scales.numel() else float(
-            scales.amax()
-        )
+        comes_first = prior is found[0] or not scales.numel()
+        return -int((scales > 0).all(0).sum()), -1.0 if comes_first else float(scales.amax())
 
     if found:
         return min(found, key=rank)
