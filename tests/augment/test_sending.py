@@ -3,7 +3,6 @@
 import copy
 import os
 import pickle
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from torch.utils.data import DataLoader, Dataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from camtorch.augment import collate
+from camtorch.native import shared_memory
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 LINUX = pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="memory is torch's own here")
@@ -157,7 +157,7 @@ def test_what_a_child_has_of_a_batch_stays():
 
 
 def test_another_strategy_of_torchs_is_kept(monkeypatch):
-    monkeypatch.setattr(sys.modules["camtorch.augment.collate"], "get_sharing_strategy", lambda: "file_system")
+    monkeypatch.setattr(shared_memory, "get_sharing_strategy", lambda: "file_system")
     for _, batch in numbered(loader()):
         assert batch["image"].is_shared()
         assert not batch["number"].is_shared()
