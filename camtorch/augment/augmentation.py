@@ -358,7 +358,7 @@ class Augmentation(SampleTransform):
                 self.tell_of_empty_images(camera)
         moved = self._moved(sample, batch, change)
         if self.place or PLACE in sample:
-            put_place(sample, moved, self._name)
+            put_crop_place(sample, moved, self._name)
         return moved, change
 
     @on_samples
@@ -426,7 +426,7 @@ class Augmentation(SampleTransform):
         return ", ".join(parts + [f"{name}={value!r}" for name, value in said.items()])
 
 
-def put_place(sample: Mapping[str, Any], moved: dict[str, Any], owner: str) -> None:
+def put_crop_place(sample: Mapping[str, Any], moved: dict[str, Any], owner: str) -> None:
     """Put `crop_place` into a moved sample, by its camera and by all that turned it; see `ct.views.crop_place`."""
     if PLACE in sample and not ("rotation" in sample and "camera" in moved):
         raise ValueError(

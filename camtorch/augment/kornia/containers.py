@@ -21,11 +21,11 @@ from kornia.geometry.boxes import Boxes
 from torch import Tensor, nn
 
 from camtorch import augment
-from camtorch.augment.augmentation import put_place
+from camtorch.augment.augmentation import put_crop_place
 from camtorch.augment.change import Change
 from camtorch.augment.fields import OWN, PLACE
 from camtorch.augment.front_end import FrontEnd
-from camtorch.augment.kornia.params import Params, parts_of, with_cameras
+from camtorch.augment.kornia.params import Params, params_of_each, with_cameras
 from camtorch.augment.kornia.private import BasicAugmentationBase
 from camtorch.augment.matrices import Guess, pinhole_of_matrix
 from camtorch.augment.names import is_text, kind_of
@@ -52,9 +52,12 @@ def _read_dict(container: Any, given: Sample, ours: list[FrontEnd]) -> _Dict:
         raise ValueError(f"{owner}: a flag must be no kornia key; got {flags[0]}. Use its own keypoints_valid")
     image = next((rest[name] for name, key in keys.items() if key == [DataKey.INPUT]), None)
     is_single = image is not None and image.ndim < 4
-    named = {name: kind for one in ours for name, kind in one.augmentation.fields.items()}
-    filled = {name: rest[name] for name in unknown if rest[name] is not None}
-    kinds = {n: kind for n, value in filled.items() if (kind := kind_of(n, value, named, owner, is_single))}
+    option = {name: kind for one in ours for name, kind in one.augmentation.fields.items()}
+    kinds = {}
+    for name in unknown:
+        kind = None if rest[name] is None else kind_of(name, rest[name], option, owner, is_single)
+        if kind is not None:
+            kinds[name] = kind
     if rest.get(PLACE) is not None and "rotation" not in kinds:
         raise ValueError(
             f"{owner}: a sample with {PLACE} must have the rotation that came with it, as it follows from that and the "
@@ -64,19 +67,21 @@ def _read_dict(container: Any, given: Sample, ours: list[FrontEnd]) -> _Dict:
     _check_others(container, [*moving, *(PLACE for one in ours if one.augmentation.place)])
     tables = {n for one in ours if one.augmentation.mirroring for n in one.augmentation.mirroring.by_name}
     fields = {n: rest[n] for n in unknown if n in kinds or n.removesuffix("_valid") in kinds or n in tables}
-    fields |= {PLACE: rest[PLACE]} if rest.get(PLACE) is not None else {}
+    if rest.get(PLACE) is not None:
+        fields[PLACE] = rest[PLACE]
     return _Dict(texts, rest, Single(fields) if is_single else fields, kinds, image, given.get("camera"))
 
 
 def _check_others(container: Any, names: list[str]) -> None:
     """Raise a ValueError if the container holds augmentations of kornia's own that would leave fields unmoved."""
-    known = FrontEnd, IntensityAugmentationBase2D
-    others = (m for m in container.modules() if isinstance(m, BasicAugmentationBase) and not isinstance(m, known))
-    for other in (type(module).__name__ for module in others if names):
-        name = next((name for name in (other, other.removeprefix("Random")) if hasattr(augment, name)), None)
-        how = f"camtorch.augment.kornia.{name}, which moves" if name else "augmentations of camtorch alone, which move"
+    for module in container.modules() if names else ():
+        if not isinstance(module, BasicAugmentationBase) or isinstance(module, (FrontEnd, IntensityAugmentationBase2D)):
+            continue
+        theirs = type(module).__name__
+        ours = next((name for name in (theirs, theirs.removeprefix("Random")) if hasattr(augment, name)), None)
+        how = f"camtorch.augment.kornia.{ours}, which moves" if ours else "augmentations of camtorch alone, which move"
         raise ValueError(
-            f"{type(container).__name__}: parts must move {', '.join(names)} too; got kornia's {other}. Use {how} "
+            f"{type(container).__name__}: parts must move {', '.join(names)} too; got kornia's {theirs}. Use {how} "
             "everything"
         )
 
@@ -97,16 +102,8 @@ def _given_camera(container: Any, read: _Dict, ours: list[FrontEnd]) -> Any:
     return camera
 
 
-def _params_for(container: Any, camera: Any, image: Tensor | None, params: Any) -> Any:
-    """Return params with the numbers of cameras; without any, drawn for the image."""
-    if params is None and image is not None:
-        dims = (3, 5) if container.contains_video_sequential else (2, 4)
-        params = container.forward_parameters(container.autofill_dim(image, dim_range=dims)[1])
-    return with_cameras(params, camera)
-
-
 @on_samples
-def _fields_moved(part: Any, fields: Sample, params: Params, kinds: dict[str, str], back: bool) -> Sample:
+def _fields_moved(one: Any, fields: Sample, params: Params, kinds: dict[str, str], back: bool) -> Sample:
     """Move the fields of a dict that kornia does not know by one of ours, and return them with their flags.
 
     From an augmentation with `place`, `crop_place` comes out as well, and the rotation from which it follows.
@@ -115,15 +112,15 @@ def _fields_moved(part: Any, fields: Sample, params: Params, kinds: dict[str, st
     clips = int(params["video_batch_size"]) if "video_batch_size" in params else None
     flat = {n: v.flatten(0, 1) for n, v in fields.items()} if clips else fields
     with torch.autocast(device.type, enabled=False):
-        change = part.change(params, device)
+        change = one.change(params, device)
         if kinds:
-            moved = part.augmentation.moved_by(change.inverse() if back else change, flat, kinds, predicted=back)
+            moved = one.augmentation.moved_by(change.inverse() if back else change, flat, kinds, predicted=back)
         else:  # beside the crop's place
             batched = not isinstance(fields, Single)
             moved = {"rotation": change.rotation_for_sample(batched), "camera": change.camera_for_sample(batched)}
-    names = {*fields, PLACE, "rotation"} if part.augmentation.place else {*fields}
+    names = {*fields, PLACE, "rotation"} if one.augmentation.place else {*fields}
     if PLACE in names and not back:
-        put_place(flat, moved, type(part).__name__)
+        put_crop_place(flat, moved, type(one).__name__)
     kept = {n: v for n, v in moved.items() if n in names or n.removesuffix("_valid") in kinds}
     return {n: v.unflatten(0, (clips, -1)) for n, v in kept.items()} if clips else type(fields)(kept)
 
@@ -136,19 +133,23 @@ def _with_fields(
         return call(self, *args, params=params, data_keys=data_keys)
     ours = [one for one in self.modules() if isinstance(one, FrontEnd)]
     read = _read_dict(self, args[0], ours)
-    if (camera := _given_camera(self, read, ours)) is not None and not back:
-        params = _params_for(self, camera, read.image, params)
+    camera = _given_camera(self, read, ours)
+    if camera is not None and not back:
+        if params is None and read.image is not None:
+            dims = (3, 5) if self.contains_video_sequential else (2, 4)
+            params = self.forward_parameters(self.autofill_dim(read.image, dim_range=dims)[1])
+        params = with_cameras(params, camera)
     result, fields = call(self, read.rest, params=params), read.fields
-    applied = [pair for pair in parts_of(self._params if params is None else params, self) if pair[0] in ours]
     kinds, with_camera = read.kinds, read.camera is not None
-    for part, drawn in reversed(applied) if back else applied:
-        adds_place = part.augmentation.place and not back
+    applied = [pair for pair in params_of_each(self._params if params is None else params, self) if pair[0] in ours]
+    for one, its_params in reversed(applied) if back else applied:
+        adds_place = one.augmentation.place and not back
         if kinds or adds_place:
-            fields = _fields_moved(part, fields, drawn, kinds, back)
+            fields = _fields_moved(one, fields, its_params, kinds, back)
         if adds_place:  # it follows from both, also through later augmentations
             kinds, with_camera = {**kinds, "rotation": "rotation"}, True
         if with_camera:
-            change: Change = part.change(drawn)
+            change: Change = one.change(its_params)
             cameras = change.source if back else change.target
             cameras = (cameras[0] if isinstance(read.fields, Single) else cameras).clone()
             result["camera"] = list(cameras) if isinstance(read.camera, list) else cameras

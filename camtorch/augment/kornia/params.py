@@ -33,10 +33,10 @@ def with_boxes(params: Any, boxes: Tensor) -> Any:
     given = as_values(boxes, "boxes", "with_boxes")
     check_boxes(given, "boxes", "with_boxes")
     result, found = _edited(params, "box", "with_boxes: params must be those of a BoxCrop")
-    for part, name in found:
-        if tuple(given.shape) != (len(part[name]), 4):
-            raise ValueError(f"with_boxes: boxes must be ({len(part[name])}, 4); got {tuple(given.shape)}")
-        part[name] = given
+    for one, name in found:
+        if tuple(given.shape) != (len(one[name]), 4):
+            raise ValueError(f"with_boxes: boxes must be ({len(one[name])}, 4); got {tuple(given.shape)}")
+        one[name] = given
     return result
 
 
@@ -60,35 +60,36 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
             f"with_cameras: cameras must be a batch, or a list, of one model and size; got {type(cameras).__name__}"
         )
     result, found = _edited(params, KIND, "with_cameras: params must be those of a camera augmentation")
-    for part, name in found:
-        kinds, kind, batch = part[name], kind_of_camera(cameras), tuple(cameras.batch_shape)
+    kind, batch = kind_of_camera(cameras), tuple(cameras.batch_shape)
+    for one, name in found:
+        kinds = one[name]
         if len(kinds) and kinds[0].tolist() != kind:
             raise ValueError(f"with_cameras: cameras must be of the params' model and image_size; got {cameras!r:.200}")
-        count, clips = len(kinds), int(part.get("video_batch_size", len(kinds)))
+        count, clips = len(kinds), int(one.get("video_batch_size", len(kinds)))
         if batch not in ((), (1,), (count,), (clips,)):
             raise ValueError(f"with_cameras: cameras must be {count}, one for each sample; got batch dims {batch}")
         frames = count // clips if batch == (clips,) and clips else 1
         for key, numbers in zip(_NUMBERS, (cameras.intrinsics, cameras.distortion), strict=True):
-            part[key] = numbers.expand(*(batch or (1,)), -1).repeat_interleave(frames, 0).expand(count, -1)
+            one[key] = numbers.expand(*(batch or (1,)), -1).repeat_interleave(frames, 0).expand(count, -1)
     return result
 
 
 def _edited(params: Any, name: str, need: str) -> tuple[Any, list[tuple[Params, str]]]:
     """Return a copy of params, and the dicts in it that hold `name`, each with its key; raise if there are none."""
     result = pytree.tree_map(lambda value: value, params)
-    found = [(part, key) for _, part in parts_of(result) for key in part if key.rpartition(".")[2] == name]
+    found = [(one, key) for _, one in params_of_each(result) for key in one if key.rpartition(".")[2] == name]
     if not found:
         raise ValueError(f"{need}; got {shown(params)}")
     return result, found
 
 
-def parts_of(params: Any, module: nn.Module | None = None) -> Iterator[tuple[Any, Params]]:
+def params_of_each(params: Any, module: nn.Module | None = None) -> Iterator[tuple[Any, Params]]:
     """Yield the params of single augmentations, in order, with the augmentation if they are those of `module`."""
     if isinstance(params, dict):
         yield module, params
     for item in params if isinstance(params, (list, tuple)) else ():
         if isinstance(item, ParamItem):
-            yield from parts_of(item.data, None if module is None else module.get_submodule(item.name))
+            yield from params_of_each(item.data, None if module is None else module.get_submodule(item.name))
 
 
 def camera_with_params(params: Params, camera: Camera, device: torch.device | None) -> Camera:
