@@ -27,8 +27,8 @@ from camtorch.native import structs
 from camtorch.native.library import loaded
 from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.projection.evaluation import camera_rows
-from camtorch.projection.native_cameras import Lenses, Native, address, lenses_of
-from camtorch.projection.rows import CameraRows, domain_for, single_native
+from camtorch.projection.native_cameras import Lenses, Native, address, lenses_of, native_of
+from camtorch.projection.rows import CameraRows
 from camtorch.rays.lattices import defined_or
 from camtorch.values.arguments import present
 from camtorch.values.module import model_of, remade
@@ -256,7 +256,8 @@ class Start:
             # the function keeps the call, of which the struct is a part, and all that this points to
             return Native(base.plan, call.made, partial(self._lenses, call, room, k))
         if intrinsics.ndim == 1:
-            return single_native(model_of(self.base), torch.from_numpy(intrinsics), torch.from_numpy(k))
+            numbers_of_one = torch.from_numpy(intrinsics)[None], torch.from_numpy(k)[None]
+            return native_of(model_of(self.base).optics, *numbers_of_one, None, tables=True)
         return None
 
     def _candidates(self, values: Mapping[str, Any], call: structs.Draws) -> Native:
@@ -309,6 +310,6 @@ class Start:
         def new() -> Lenses:
             struct = structs.Cameras.from_buffer_copy(call.made)
             struct.hold((call, room, self))
-            return Lenses(plan, model.optics, k, partial(domain_for, model, k, False), struct)
+            return Lenses(plan, model.optics, k, struct)
 
         return lenses_of(plan, k, new)

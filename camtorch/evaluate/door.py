@@ -201,10 +201,9 @@ class Way(NamedTuple):
     is_native: bool  # native code evaluates the call, if it has the model
     learns: bool  # autograd records the native call, with its derivatives
     is_known: bool  # the values of the parameters may be read, so that results made of them are kept
-    order: int  # of the derivatives that the recorded formula must have exactly
 
 
-_NATIVE, _LEARNING = Way(True, False, True, 2), Way(True, True, True, 2)
+_NATIVE, _LEARNING = Way(True, False, True), Way(True, True, True)
 
 
 def way_of(owner: str, values: Tensor, *parameters: Tensor) -> Way:
@@ -229,9 +228,7 @@ def way_of(owner: str, values: Tensor, *parameters: Tensor) -> Way:
             )
         if in_memory(values) and not in_jit_trace() and torch._C._len_torch_dispatch_stack() == 0:
             return _LEARNING if learns and torch.is_grad_enabled() else _NATIVE
-    is_known = all(is_concrete(t) and not has_tangent(t) for t in parameters)
-    # torch.compile records no derivatives of derivatives
-    return Way(False, False, is_known, 1 if torch.compiler.is_compiling() else 2)
+    return Way(False, False, all(is_concrete(t) and not has_tangent(t) for t in parameters))
 
 
 def while_loop(condition: Callable[..., Any], body: Callable[..., Any], state: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from camtorch.evaluate.door import keeps_graph, set_aside, while_loop
+from camtorch.evaluate.door import set_aside, while_loop
 
 _recording = False
 
@@ -22,12 +22,12 @@ def is_portable_export() -> bool:
 
 
 @contextmanager
-def portable_export(inputs: Tensor) -> Iterator[int]:
-    """Record cameras like that in here; yield the order of the derivatives by `inputs` that the record must have."""
+def portable_export() -> Iterator[None]:
+    """Record cameras like that in here."""
     global _recording
     before, _recording = _recording, True
     try:
-        yield 1 if keeps_graph(inputs) else 0
+        yield
     finally:
         _recording = before
 

@@ -80,10 +80,13 @@ def power_of_two(size: Tensor) -> Tensor:
     return (size.view(integer) & exponent).view(size.dtype)
 
 
-def order_of(order: int, *inputs: Tensor) -> int:
-    """Return the order of the derivatives that a recorded inverse must have: 0 if nothing learns, and that is known."""
-    known = is_eager(*inputs) or (torch.compiler.is_compiling() and not in_transform())
-    return 0 if known and not keeps_graph(*inputs) else order
+def order_of(*inputs: Tensor) -> int:
+    """Return up to which order derivatives of a formula must be exact: 0 if nothing learns, and that is known."""
+    is_compiling = torch.compiler.is_compiling()
+    is_known = (is_compiling and not in_transform()) or is_eager(*inputs)
+    if is_known and not keeps_graph(*inputs):
+        return 0
+    return 1 if is_compiling else 2  # torch.compile records no derivatives of derivatives
 
 
 def without_keeping(function: Callable[..., Result], *inputs: Tensor) -> Result:

@@ -1,14 +1,13 @@
 """The evaluation of cameras: the way that a call takes, and the results kept of a camera for the next one.
 
 `evaluate_points` shapes points to rows, and a camera's `_evaluate` calls `evaluate_rows`: as a constant of an exported
-program, in native code (`_Native` if something learns), or by the formula. `camera_rows` keeps results of parameters.
+program, in native code (by `_NativeCall` if something learns), or by the formula. `camera_rows` keeps their results.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -36,15 +35,14 @@ def evaluate_points(camera: CameraLike, direction: Direction, values: Numbers) -
     """Return the planes and the mask of `evaluate_rows` for values (*B, *N, size), in their shape."""
     batch, tensors, size = camera.batch_shape, camera.tensors, direction.size
     lead, dims = batch, len(batch)
-    if (
-        not isinstance(values, Tensor)
-        or values.dtype != tensors[0].dtype
-        or values.dtype != tensors[-1].dtype  # the tensors of a Mixed have one dtype
-        or values.device != tensors[0].device
-        or values.layout is not torch.strided
-        or values.ndim <= dims
-        or values.shape[-1] != size
-        or values.shape[:dims] != batch
+    if not (
+        isinstance(values, Tensor)
+        and values.layout is torch.strided
+        and values.dtype == tensors[0].dtype == tensors[-1].dtype  # the tensors of a Mixed have one dtype
+        and values.device == tensors[0].device
+        and values.ndim > dims
+        and values.shape[:dims] == batch
+        and values.shape[-1] == size
     ):
         values, lead = as_points(values, direction.name, size, batch, tensors, type(camera).__name__)
     shape = values.shape[:-1]
@@ -70,33 +68,36 @@ def evaluate_rows(
     may hold it as a constant.
     """
     intrinsics, distortion = per_row(tensors, lead, rows)
-    inputs = rows, intrinsics, distortion
-    way = way_of(model.__name__, *inputs)
+    way = way_of(model.__name__, rows, intrinsics, distortion)
     if constant is not None and not way.is_native and is_constant(constant) and all(type(side) is int for side in lead):
         with with_values(constant):
             intrinsics, distortion = per_row(constant.tensors, lead, rows)
             cameras = cameras_of(intrinsics, distortion).as_constant()
-        with portable_export(rows) as order:
-            return direction.formula(model, rows, intrinsics, distortion, cameras, order)
+        with portable_export():
+            return direction.formula(model, rows, intrinsics, distortion, cameras)
     known = cameras_of(intrinsics, distortion) if way.is_known else None
-    if way.is_native and known is not None and (native := known.native) is not None:
-        if way.learns:
-            planes, valid = _Native.apply(*inputs, known, direction)  # type: ignore[no-untyped-call]
-            return planes, valid
-        planes, valid, *_ = direction.native(native, rows.detach())
+    native = known.native if known is not None and way.is_native else None
+    if native is not None and way.learns:
+        planes, valid = _NativeCall.apply(  # type: ignore[no-untyped-call]
+            rows, intrinsics, distortion, direction, native, known
+        )
+        return planes, valid
+    if native is not None:
+        planes, valid, _ = direction.native(native, rows, False)
         return planes, valid
     if way.is_native and rows.shape[0] * rows.shape[1] >= _MANY_POINTS:
         warn_if_missing()
-    # the formula: all at once, or block by block, which stay in a cache from one operation to the next
-    formula = partial(direction.formula, model)
-    if known is None or rows.shape[0] * rows.shape[1] <= _BLOCK_POINTS or not are_free(*inputs):
-        return formula(*inputs, known, way.order)
-    step = max(_BLOCK_POINTS * torch.get_num_threads() // len(rows), 1)
+    few = known is None or rows.shape[0] * rows.shape[1] <= _BLOCK_POINTS
+    if few or not are_free(rows, intrinsics, distortion):
+        return direction.formula(model, rows, intrinsics, distortion, known)
+    # block by block, which stay in a cache from one operation to the next
     planes = rows.new_empty(direction.size_out, *rows.shape[:2])
     valid = torch.empty(planes.shape[1:], dtype=torch.bool, device=planes.device)
-    for i in range(0, rows.shape[1], step):
-        part = slice(i, i + step)
-        planes[..., part], valid[..., part] = formula(rows[:, part], intrinsics, distortion, known, way.order)
+    step = max(_BLOCK_POINTS * torch.get_num_threads() // len(rows), 1)
+    for start in range(0, rows.shape[1], step):
+        block = slice(start, start + step)
+        results = direction.formula(model, rows[:, block], intrinsics, distortion, known)
+        planes[..., block], valid[..., block] = results
     return planes, valid
 
 
@@ -113,11 +114,11 @@ def native_forms(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[N
         inputs += pairs[-1]
     if not (dtype.is_floating_point and are_free(*inputs)):
         return None
-    made, is_batch = [], False
+    forms, is_batch = [], False
     for camera, (intrinsics, distortion) in zip(cameras, pairs, strict=True):
-        if intrinsics.dtype != dtype or distortion.dtype != dtype:
+        if not intrinsics.dtype == distortion.dtype == dtype:
             return None
-        if not intrinsics.ndim == distortion.ndim == 1:
+        if intrinsics.ndim > 1 or distortion.ndim > 1:
             is_batch, batch = True, intrinsics.shape[:-1]
             if distortion.shape[:-1] != batch:
                 batch = camera.batch_shape
@@ -127,21 +128,26 @@ def native_forms(cameras: Sequence[CameraLike], *values: Tensor) -> tuple[list[N
         native = camera_rows(camera, intrinsics, distortion).native
         if native is None:
             return None
-        made.append(native)
-    return made, is_batch
+        forms.append(native)
+    return forms, is_batch
 
 
-class _Native(Function):
-    """The native geometry, with derivatives; second derivatives come from the formula."""
+class _NativeCall(Function):
+    """A call of the native geometry, with derivatives; second derivatives come from the formula."""
 
     @staticmethod
     def forward(
-        ctx: Any, rows: Tensor, intrinsics: Tensor, distortion: Tensor, cameras: CameraRows, direction: Direction
+        ctx: Any,
+        rows: Tensor,
+        intrinsics: Tensor,
+        distortion: Tensor,
+        direction: Direction,
+        native: Native,
+        cameras: CameraRows,
     ) -> tuple[Tensor, Tensor]:
-        native = present(cameras.native, "compiled code for the cameras")
-        planes, valid, kept = direction.native_keeping(native, rows)
+        planes, valid, kept = direction.native(native, rows, True)
         ctx.save_for_backward(rows, intrinsics, distortion, *kept)
-        ctx.cameras, ctx.direction = cameras, direction
+        ctx.direction, ctx.native, ctx.cameras = direction, native, cameras
         ctx.mark_non_differentiable(valid)
         ctx.set_materialize_grads(False)
         return planes, valid
@@ -150,40 +156,29 @@ class _Native(Function):
     def backward(ctx: Any, by_planes: Tensor | None, _: Tensor | None) -> tuple[Tensor | None, ...]:
         """Return the cotangents of rows and parameters, with a graph if one is recorded."""
         if by_planes is None:
-            return (None,) * 5
-        rows, intrinsics, distortion, *kept = ctx.saved_tensors
-        wanted, cameras = ctx.needs_input_grad, ctx.cameras
+            return (None,) * 6
+        wanted, cameras = ctx.needs_input_grad[:3], ctx.cameras
         if torch.is_grad_enabled() or not in_memory(by_planes) or is_recorded():
             # use the formula, with a graph of its own
-            inputs = rows, intrinsics, distortion
-            leaves = [t for t, needed in zip(inputs, wanted[:3], strict=True) if needed]
+            inputs = ctx.saved_tensors[:3]
+            leaves = [t for t, needed in zip(inputs, wanted, strict=True) if needed]
             with torch.enable_grad():
-                planes = ctx.direction.formula(cameras.model, *inputs, cameras)[0]
-                left = iter(torch.autograd.grad(planes, leaves, by_planes, create_graph=True, materialize_grads=True))
-            return *(next(left) if needed else None for needed in wanted[:3]), None, None
-        of_parameters = wanted[1] or wanted[2]
-        by_rows, sums = ctx.direction.native_vjp(cameras.native, *kept, by_planes, wanted[0], of_parameters)
-        return by_rows, *cameras.cotangents(sums, wanted[1:3]), None, None
+                planes, _ = ctx.direction.formula(cameras.model, *inputs, cameras)
+                found = iter(torch.autograd.grad(planes, leaves, by_planes, create_graph=True, materialize_grads=True))
+            by_inputs = [next(found) if needed else None for needed in wanted]
+        else:
+            by_rows, sums = ctx.direction.native_vjp(
+                ctx.native, *ctx.saved_tensors[3:], by_planes, wanted[0], wanted[1] or wanted[2]
+            )
+            by_inputs = [by_rows, *cameras.cotangents(sums, wanted[1:])]
+        return *by_inputs, None, None, None
 
 
 def camera_rows(camera: CameraLike, intrinsics: Tensor, distortion: Tensor) -> CameraRows:
     """Return the rows' cameras, kept until a value changes."""
     cameras = kept_cameras(camera._memo, type(camera), intrinsics, distortion)
-    # reading values would wait for another device
-    if cameras.usable is not None and cameras.usable.is_cpu and not (camera._expects_unusable or camera._told):
-        # warn once if learning drove this module's Parameters to where no camera is, from which no gradient leads back
-        bad = (cameras.usable <= 0).flatten().nonzero()
-        found = unusable(camera, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
-        if found is not None and isinstance(getattr(camera, found[0]), nn.Parameter):
-            camera._told = True
-            name = parametrize.type_before_parametrizations(camera).__name__
-            where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
-            keeps = "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
-            keeps += '"intrinsics", PositiveFocal()), which is in camtorch.networks.parametrize'
-            warn(
-                f"{name}: {found[0]}{where} became unusable: {found[1]}. All its results are invalid and its gradients "
-                f"zero from here on. Use a smaller learning rate{keeps * (found[0] == 'intrinsics')}"
-            )
+    if cameras.usable is not None and not (camera._expects_unusable or camera._told):
+        _warn_of_unusable(camera, cameras)
     return cameras
 
 
@@ -191,19 +186,37 @@ def kept_cameras(memo: Kept, model: type[CameraLike], intrinsics: Tensor, distor
     """Return the cameras (C,) of one model, kept in a memo until a value changes."""
     cameras: CameraRows | None = memo.result
     if cameras is not None:
-        for now, (then, mark) in zip((intrinsics, distortion), cameras.notes, strict=True):
-            if mark is not None:
-                if not same(now, (then, mark)):
-                    break
-                continue
-            # a single camera comes as (n,) from warps, as (1, n) from `per_row`
-            if now.ndim != then.ndim and now.numel() == then.numel():
-                then = then[None] if now.ndim > then.ndim else then[0]
-            if now.dtype != then.dtype or now.device != then.device or not torch.equal(now, then):
+        for now, noted in zip((intrinsics, distortion), cameras.notes, strict=True):
+            then, mark = noted
+            # a single camera comes as (n,) from warps, as (1, n) from `per_row`; marks do not tell them apart
+            if mark is None and now.ndim != then.ndim and now.numel() == then.numel():
+                now = now[None] if now.ndim < then.ndim else now[0]
+            if not same(now, noted):
                 break
         else:
             return cameras
     return memo.renew(lambda: CameraRows(model, intrinsics, distortion))
+
+
+def _warn_of_unusable(camera: CameraLike, cameras: CameraRows) -> None:
+    """Warn once if learning drove a module's Parameters to where no camera is, from which no gradient leads back."""
+    usable = present(cameras.usable, "which cameras are usable")
+    if not usable.is_cpu:  # reading values would wait for the device
+        return
+    bad = (usable <= 0).flatten().nonzero()
+    found = unusable(camera, *(t[bad[0, 0]] for t in cameras.given)) if len(bad) else None
+    if found is None or not isinstance(getattr(camera, found[0]), nn.Parameter):
+        return
+    camera._told = True
+    tensor, reason = found
+    name = parametrize.type_before_parametrizations(camera).__name__
+    where = f" of camera {int(bad[0, 0])} in the batch" if len(cameras.given[0]) > 1 else ""
+    keeps = "; focal lengths stay positive after torch.nn.utils.parametrize.register_parametrization(camera, "
+    keeps += '"intrinsics", PositiveFocal()), which is in camtorch.networks.parametrize'
+    warn(
+        f"{name}: {tensor}{where} became unusable: {reason}. All its results are invalid and its gradients "
+        f"zero from here on. Use a smaller learning rate{keeps if tensor == 'intrinsics' else ''}"
+    )
 
 
 def per_row(tensors: Sequence[Tensor], lead: torch.Size, rows: Tensor) -> list[Tensor]:

@@ -24,35 +24,40 @@ _TILE_POINTS = 1 << 14  # some 30 us
 _SHARED_POINTS = 1 << 15  # with fewer, to wake threads would take longer
 
 
-def project(native: Native, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return pixels (2, C, N) of points (C, N, 3) of any strides, and whether they are valid (C, N)."""
-    cameras, count, _ = points.shape
-    pixels = _empty((2, cameras, count), native.dtype)
-    valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
-    call = structs.Rows()
-    call.rows, call.row_strides[:], call.valid = points.data_ptr(), points.stride(), valid.data_ptr()
-    call.results, call.result_strides[:] = pixels.data_ptr(), (count, 1, cameras * count)
-    call.direction = structs.PROJECT
-    _call_and_follow(native, cameras, count, call)
-    return pixels, valid
+def project(native: Native, points: Tensor, learns: bool = False) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    """Return pixels (2, C, N) of points (C, N, 3), whether they are valid (C, N), and what `project_vjp` needs."""
+    pixels, valid = _evaluate(native, structs.PROJECT, points, 2, None)
+    return pixels, valid, (points,)
 
 
-def unproject(native: Native, pixels: Tensor, keeps: bool = False) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return unit rays (3, C, N) of pixels (C, N, 2), and whether they exist (C, N).
+def unproject(native: Native, pixels: Tensor, learns: bool = False) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    """Return unit rays (3, C, N) of pixels (C, N, 2), whether they exist (C, N), and what `unproject_vjp` needs.
 
-    And, if `keeps`, the points on the chart's plane (2, C, N) that `unproject_vjp` needs.
+    That is nothing unless it `learns`; else a copy of the mask, as the returned one belongs to the caller, and the
+    points on the chart's plane (2, C, N).
     """
-    cameras, count, _ = pixels.shape
-    rays = _empty((3, cameras, count), native.dtype)
-    valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
-    solution = _empty((2, cameras, count), native.dtype) if keeps else None
     native.add_table()
-    call = structs.Rows()
-    call.rows, call.row_strides[:], call.valid = pixels.data_ptr(), pixels.stride(), valid.data_ptr()
-    call.results, call.result_strides[:] = rays.data_ptr(), (count, 1, cameras * count)
-    call.solution, call.direction = address(solution), structs.UNPROJECT
-    _call_and_follow(native, cameras, count, call)
-    return rays, valid, solution
+    solution = _empty((2, *pixels.shape[:2]), native.dtype) if learns else None
+    rays, valid = _evaluate(native, structs.UNPROJECT, pixels, 3, solution)
+    return rays, valid, () if solution is None else (valid.clone(), solution)
+
+
+def _evaluate(
+    native: Native, direction: int, rows: Tensor, size_out: int, solution: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Return the results (size_out, C, N) of rows (C, N, size) of any strides, and whether they are valid (C, N)."""
+    cameras, count, _ = rows.shape
+    results = _empty((size_out, cameras, count), native.dtype)
+    valid = torch.empty(cameras, count, dtype=torch.bool, device="cpu")
+    call = structs.Rows(direction=direction)
+    call.rows, call.row_strides[:], call.valid = rows.data_ptr(), rows.stride(), valid.data_ptr()
+    call.results, call.result_strides[:] = results.data_ptr(), (count, 1, cameras * count)
+    if solution is not None:
+        call.solution = solution.data_ptr()
+    if _call(native, cameras, count, call):  # a point lies so far out that the limits of each azimuth decide
+        native.follow()
+        _call(native, cameras, count, call)
+    return results, valid
 
 
 def project_vjp(
@@ -135,7 +140,7 @@ class Lattices:
         room: Callable[[int], Tensor] = lambda count: torch.empty(count, dtype=torch.uint8, device="cpu"),
     ):
         dtype, count, is_double = probes.dtype, probes.shape[1], probes.dtype == torch.float64
-        n, m = (-(-side // structs.STEP) for side in size)
+        n, m = -(-size[0] // structs.STEP), -(-size[1] // structs.STEP)
         nodes, self._most = (n + 5) * (m + 5), cameras * n * m
         # the first (n + 5) (m + 5) nodes are those of the lattice, the others are on the rim
         self.nodes = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
@@ -191,13 +196,14 @@ class NativeMove:
         """Prepare turns (3, 3) or (C, 3, 3), of the cameras' dtype, and the (height, width) of the others' image."""
         self._start, self._end, self._turns, self.dtype = start, end, turns, start.dtype
         self.is_batch = is_batch  # whether pixels have a batch dim
-        count, strides = (1, (0, 0)) if turns is None else (turns.numel() // 9, turns.stride())
+        self._size, count = size, 1
+        self._move = move = structs.Move()
+        if turns is not None:
+            count, strides = turns.numel() // 9, turns.stride()
+            move.turns, move.turn_strides[:] = turns.data_ptr(), (strides[0] if count > 1 else 0, *strides[-2:])
         self.cameras = max(start.cameras, end.cameras, count)
         start.add_table()
-        self._size = size
-        self._move = move = structs.Move()
-        move.from_, move.to, move.turns, move.cameras = start.pointer, end.pointer, address(turns), self.cameras
-        move.turn_strides[:] = strides[0] if count > 1 else 0, *strides[-2:]
+        move.from_, move.to, move.cameras = start.pointer, end.pointer, self.cameras
 
     def rows(self, pixels: Tensor, form: int) -> tuple[Tensor, Tensor]:
         """Return pixels (C, N, 2) of the others for pixels (C or 1, N, 2), and valid (C, N).
@@ -303,10 +309,3 @@ def _call(native: Native, cameras: int, count: int, call: structs.Rows, tile: in
     left: list[int] = []
     spread(lambda: left.append(run(call)), min(thread_count(), -(-count // _TILE_POINTS) * cameras))
     return sum(left)
-
-
-def _call_and_follow(native: Native, cameras: int, count: int, call: structs.Rows) -> None:
-    """Call the geometry, and again with the limits of each azimuth if a point lies so far out that they decide."""
-    if _call(native, cameras, count, call):
-        native.follow()
-        _call(native, cameras, count, call)

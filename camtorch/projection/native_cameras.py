@@ -8,9 +8,9 @@ A part is a chart or a stage; `parameters` are what parts compute with: coeffici
 from __future__ import annotations
 
 import ctypes
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from ctypes import addressof, c_double
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -22,14 +22,16 @@ from camtorch.native import structs
 from camtorch.native.library import library, loaded
 from camtorch.optics.backprojection import FURTHEST
 from camtorch.optics.radial_inverse import TABLE_WIDTH
+from camtorch.projection.domain import Domain
 from camtorch.values.arguments import columns
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from camtorch.optics.charts import Chart
     from camtorch.optics.lens import Lens, Stage
     from camtorch.optics.model_spec import Optics
     from camtorch.optics.radial import RadialFactor
-    from camtorch.projection.domain import Domain
 
 
 class ModelPlan:
@@ -53,28 +55,29 @@ class ModelPlan:
         self.fixed_ends: dict[torch.dtype, tuple[float, float]] = {}  # if all cameras have them, after a call of `ends`
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
-    def ends(self, chart: Callable[[], Chart], dtype: torch.dtype) -> tuple[float | Tensor, float | Tensor]:
-        """Return the radii at which the chart of some cameras ends, and beyond which there are no images."""
+    def ends(self, lenses: Lenses) -> tuple[float | Tensor, float | Tensor]:
+        """Return the radii at which the chart of some lenses ends, and beyond which there are no images."""
         if self.chart_is_inverted:
             return FURTHEST, FURTHEST
+        dtype = lenses.k.dtype
         if dtype in self.fixed_ends:
             return self.fixed_ends[dtype]
-        made = chart()
-        end, usual_end = made.end(dtype), made.usual_end(dtype)
-        if not (made.parameters or isinstance(end, Tensor) or isinstance(usual_end, Tensor)):
+        chart, _ = lenses.precise_optics
+        end, usual_end = chart.end(dtype), chart.usual_end(dtype)
+        if not (chart.parameters or isinstance(end, Tensor) or isinstance(usual_end, Tensor)):
             self.fixed_ends[dtype] = end, usual_end
         return end, usual_end
 
-    def radii(self, chart: Callable[[], Chart], count: int, like: Tensor) -> Tensor:
-        """Return the radii of the chart of some cameras, like `Chart.radii`, in double precision."""
-        key = like.dtype, count
-        if key not in self._radii:
-            made = chart()
-            radii = made.radii(count, like).double()
-            if made.parameters:
-                return radii
+    def radii(self, lenses: Lenses, count: int, dtype: torch.dtype) -> Tensor:
+        """Return the radii of the chart of some lenses, like `Chart.radii`, in double precision."""
+        key = dtype, count
+        if key in self._radii:
+            return self._radii[key]
+        chart, _ = lenses.precise_optics
+        radii = chart.radii(count, lenses.k.to(dtype)).double()
+        if not chart.parameters:
             self._radii[key] = radii
-        return self._radii[key]
+        return radii
 
     def parameters_of(self, optics_of: Optics, k: Tensor) -> Tensor:
         """Return the parameters (C, parameters) for coefficients (C, n)."""
@@ -90,47 +93,49 @@ _plans = Kept(64)  # keyed by optics and number of coefficients
 class Lenses:
     """The lenses of cameras (C,) in the form of the native geometry: numbers, and their domains as far as known."""
 
-    def __init__(
-        self, plan: ModelPlan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], struct: structs.Cameras
-    ):
-        """Take coefficients (C, n) and their struct, null where nothing is known; `domain` is for what C lacks."""
-        self.plan, self.optics_of, self.k, self.python_domain, self.struct = plan, optics_of, k, domain, struct
+    def __init__(self, plan: ModelPlan, optics_of: Optics, k: Tensor, struct: structs.Cameras):
+        """Take coefficients (C, n) and their struct, null where nothing is known."""
+        self.plan, self.optics_of, self.k, self.struct = plan, optics_of, k, struct
 
     @classmethod
-    def of(cls, plan: ModelPlan, optics_of: Optics, k: Tensor, domain: Callable[[], Domain], tables: bool) -> Lenses:
+    def of(cls, plan: ModelPlan, optics_of: Optics, k: Tensor, tables: bool) -> Lenses:
         """Return the lenses of coefficients (C, n) with their domains, and the table for the inverse if `tables`."""
         struct = structs.Cameras(cameras=len(k), is_double=k.dtype == torch.float64)
         struct.hold(k)
         struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
-        lenses = cls(plan, optics_of, k, domain, struct)
+        lenses = cls(plan, optics_of, k, struct)
         if plan.parameters:
             struct.parameters = lenses._keep(plan.parameters_of(optics_of, k))
-        if plan.places is None and (constants := _constants(optics_of(columns(k))[1])):
-            struct.constants, struct.constant_count = lenses._keep_columns(constants), len(constants)
+        constants = _constants(optics_of(columns(k))[1]) if plan.places is None else ()
+        if constants:
+            struct.constants, struct.constant_count = lenses._keep_columns(constants, k.dtype), len(constants)
         if plan.chart_is_inverted:
             lenses._add_chart()
         if plan.has_stages:
             lenses._add_domain(tables)
         return lenses
 
-    def _optics(self) -> tuple[Chart, Lens]:
+    @cached_property
+    def precise_optics(self) -> tuple[Chart, Lens]:
+        """The chart and the lens in double precision."""
         return self.optics_of(columns(self.k.double()))
 
-    @functools.cached_property
+    @cached_property
     def request(self) -> structs.Domain:
         """The request for the domain, with optics in double precision."""
-        plan, dtype = self.plan, self.k.dtype
+        plan, k = self.plan, self.k
         made = structs.Domain(is_double=self.struct.is_double, cameras=self.struct.cameras, is_radial=plan.is_radial)
+        made.parts, made.part_count, made.parameter_count = addressof(plan.parts), plan.count, plan.parameters
         # parameters that the model computes are computed in double precision
-        k = self.k if plan.places is not None else self.k.double()
-        parameters = plan.parameters_of(self.optics_of, k) if plan.parameters else k
-        made.parts, made.part_count = addressof(plan.parts), plan.count
-        made.parameters, made.parameter_count = self._keep(parameters.double()), plan.parameters
-        made.most = torch.finfo(dtype).max ** 0.25
-        made.ends, made.usual_ends = map(self._keep_ends, plan.ends(lambda: self._optics()[0], dtype))
+        given = k if plan.places is not None else k.double()
+        parameters = plan.parameters_of(self.optics_of, given) if plan.parameters else k
+        made.parameters = self._keep(parameters.double())
+        made.most = torch.finfo(k.dtype).max ** 0.25
+        made.ends, made.usual_ends = map(self._keep_ends, plan.ends(self))
         if plan.places is None or plan.is_long:
-            chart, lens = self._optics()
-            if constants := _constants(lens):
+            chart, lens = self.precise_optics
+            constants = _constants(lens)
+            if constants:
                 made.constants, made.constant_count = self._keep_columns(constants, torch.float64), len(constants)
             factor = chart.factor(chart.parameters) if isinstance(chart, optics.Inverted) else lens.radial
             if factor is not None:
@@ -139,20 +144,12 @@ class Lenses:
                 made.folds = None if fold is None else self._keep(fold.expand(self.struct.cameras, 1))
         return made
 
-    def _keep_ends(self, end: float | Tensor) -> int:
-        if isinstance(end, float):
-            return self.struct.keep(_same_ends(end, self.struct.cameras))
-        return self._keep(end.expand(self.struct.cameras, 1).double())
-
     def _fill(self, wanted: dict[str, int]) -> None:
         """Have C fill in parts of the domain: wanted are their addresses, and those of inputs, by name."""
         request = structs.Domain.from_buffer_copy(self.request)  # several threads may request at once
         for name, pointer in wanted.items():
             setattr(request, name, pointer)
         loaded().camtorch_domain(request)
-
-    def _new(self, columns: int) -> int:
-        return self._keep(self.k.new_empty(self.struct.cameras, columns))
 
     def _add_chart(self) -> None:
         """Set the fold and the inverse of a chart that is defined in the other direction."""
@@ -162,29 +159,32 @@ class Lenses:
         struct.chart_most2 = self._keep(table[:, 1])
 
     def _add_domain(self, tables: bool) -> None:
-        plan = self.plan
-        if plan.chart_is_inverted:  # its end comes from a search
-            domain = self.python_domain()
-            self.struct.image_radius_sq = self._keep(domain.image_radius_sq)
-            self.struct.safe_radius_sq = self._keep(domain.safe_radius_sq)
+        """Set how far out the lenses are one-to-one, and the table for their inverse if `tables`."""
+        plan, struct = self.plan, self.struct
+        if plan.chart_is_inverted:  # its end comes from a search, which C lacks
+            domain = Domain(self.optics_of, self.k)
+            struct.image_radius_sq, struct.safe_radius_sq = map(
+                self._keep, (domain.image_radius_sq, domain.safe_radius_sq)
+            )
             return
-        names = ["safe_radius_sq", "image_radius_sq", *["image_circle_sq", "stagewise"] * plan.has_rest]
+        names = ["safe_radius_sq", "image_radius_sq"]
+        if plan.has_rest:
+            names += ["image_circle_sq", "stagewise"]
         width = len(names)
-        if tables and plan.has_factor:  # made now, as pixels will follow
+        if tables and plan.has_factor:
             names, width = [*names, "table"], width + TABLE_WIDTH
         # in one piece of memory: a column each, and last the table
-        start, step = self._new(width), self.struct.cameras * self.k.dtype.itemsize
-        wanted = {name: start + step * i for i, name in enumerate(names)}
-        radii = None if plan.is_radial else plan.radii(lambda: self._optics()[0], structs.MOST_RADII, self.k)
-        self._fill(wanted if radii is None else wanted | {"radii": self._keep(radii)})
-        for name, pointer in wanted.items():
-            setattr(self.struct, name, pointer)
+        start, step = self._new(width), struct.cameras * self.k.dtype.itemsize
+        made = {name: start + step * i for i, name in enumerate(names)}
+        inputs = {} if plan.is_radial else {"radii": self._keep(plan.radii(self, structs.MOST_RADII, self.k.dtype))}
+        self._fill(made | inputs)
+        for name, pointer in made.items():
+            setattr(struct, name, pointer)
 
     def radii_wanted(self) -> dict[str, Tensor]:
         """Return the radii on which lenses are followed, by their names in a request."""
         names = {"radii": structs.MOST_RADII, "even": structs.RADII, "coarse": structs.RADII // 2}
-        chart, like = self._optics()[0], self.k.double()
-        return {name: self.plan.radii(lambda: chart, count, like) for name, count in names.items()}
+        return {name: self.plan.radii(self, count, torch.float64) for name, count in names.items()}
 
     def inverse_table(self) -> int:
         """Return the address of the table for the inverse of the radial factor, made at first use."""
@@ -202,7 +202,7 @@ class Lenses:
             wanted |= {name: getattr(struct, name) for name in ("image_circle_sq", "stagewise")}
             wanted |= {name: self._keep(radii) for name, radii in self.radii_wanted().items()}
             if self.plan.chart_is_inverted:
-                wanted["ends"] = self._keep_ends(self._optics()[0].end(self.k.dtype))
+                wanted["ends"] = self._keep_ends(self.precise_optics[0].end(self.k.dtype))
             self._fill(wanted)
             struct.extent, struct.limits2 = wanted["extent"], wanted["limits2"]
         return struct.limits2, struct.extent
@@ -214,24 +214,29 @@ class Lenses:
         if self.plan.has_stages and not self.plan.is_radial:
             self.followed()
         widths = dict.fromkeys(("safe_radius_sq", "image_radius_sq", "image_circle_sq", "stagewise"), 1)
+        widths |= {"table": TABLE_WIDTH, "limits2": structs.AZIMUTHS}
         made, count = {}, self.struct.cameras
-        for name, width in {**widths, "table": TABLE_WIDTH, "limits2": structs.AZIMUTHS}.items():
-            if (pointer := getattr(self.struct, name)) is not None:
+        for name, width in widths.items():
+            pointer = getattr(self.struct, name)
+            if pointer is not None:
                 dtype = torch.bool if name == "stagewise" else self.k.dtype
                 memory = (ctypes.c_char * (count * width * dtype.itemsize)).from_address(pointer)
                 made[name] = torch.frombuffer(memory, dtype=dtype).view(count, width).clone()
         return made
 
+    def _new(self, columns: int) -> int:
+        return self._keep(self.k.new_empty(self.struct.cameras, columns))
+
     def _keep(self, tensor: Tensor) -> int:
         return self.struct.keep(tensor.contiguous())
 
-    def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype | None = None) -> int:
-        return self._keep(torch.cat([c.expand(self.struct.cameras, 1) for c in columns], -1).to(dtype or self.k.dtype))
+    def _keep_ends(self, end: float | Tensor) -> int:
+        if isinstance(end, Tensor):
+            return self._keep(end.expand(self.struct.cameras, 1).double())
+        return self.struct.keep((c_double * self.struct.cameras)(*[end] * self.struct.cameras))
 
-
-@functools.lru_cache(maxsize=16)
-def _same_ends(end: float, cameras: int) -> ctypes.Array[c_double]:
-    return (c_double * cameras)(*[end] * cameras)
+    def _keep_columns(self, columns: Sequence[Tensor], dtype: torch.dtype) -> int:
+        return self._keep(torch.cat([c.expand(self.struct.cameras, 1) for c in columns], -1).to(dtype))
 
 
 _MOST_COEFFICIENTS = 512  # of lenses that are kept
@@ -253,7 +258,7 @@ class Native:
         self.plan, self.struct, self.pointer, self._find_lenses = plan, struct, addressof(struct), lenses
         self.cameras, self.dtype = struct.cameras, torch.float64 if struct.is_double else torch.float32
 
-    @functools.cached_property
+    @cached_property
     def lenses(self) -> Lenses:
         """The lenses of the cameras, which other cameras may share."""
         return self._find_lenses()
@@ -273,12 +278,12 @@ class Native:
 
 
 def native_of(
-    optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None, domain: Callable[[], Domain], tables: bool
+    optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None, tables: bool = False
 ) -> Native | None:
     """Return cameras of intrinsics (C, 4) and coefficients (C, n) in the form of the native geometry.
 
     None without a library, on another device, and if a part of the optics has no code: a user's own. usable: (C, 1),
-    None if all are. domain: for parts that native code lacks. tables: whether the inverse is sure to come.
+    None if all are. tables: Whether to make the table for the inverse now, as pixels are sure to follow.
     """
     if library() is None or not intrinsics.is_cpu or not k.shape[0]:
         return None
@@ -292,7 +297,7 @@ def native_of(
     plan = _plans((), (optics_of, k.shape[-1]), planned)
     if plan is None:
         return None
-    lenses = lenses_of(plan, k, lambda: Lenses.of(plan, optics_of, k, domain, tables))
+    lenses = lenses_of(plan, k, lambda: Lenses.of(plan, optics_of, k, tables))
     struct = structs.Cameras.from_buffer_copy(lenses.struct)
     struct.intrinsics = struct.keep(intrinsics.contiguous())
     struct.usable = None if usable is None else struct.keep((usable > 0).contiguous())
@@ -306,16 +311,16 @@ def codes(chart: Chart, lens: Lens) -> list[structs.Part] | None:
     return known if len(known) == len(parts) <= structs.MOST_PARTS else None
 
 
-def _code(part: Chart | Stage | RadialFactor | type[RadialFactor]) -> int | None:
-    # a subclass may have another formula
-    return vars(part if isinstance(part, type) else type(part)).get("code")
+def _code(kind: type[Chart | Stage | RadialFactor]) -> int | None:
+    # a subclass, which inherits the code, may have another formula
+    return vars(kind).get("code")
 
 
 def _chart(chart: Chart) -> structs.Part | None:
     flags = 0
     if type(chart) is optics.Transverse:
         chart, flags = chart.chart, structs.TRANSVERSE
-    kind = _code(chart)
+    kind = _code(type(chart))
     if kind is None:
         return None
     part = structs.Part(kind=kind, flags=flags)
@@ -324,33 +329,37 @@ def _chart(chart: Chart) -> structs.Part | None:
         part.flags |= structs.HAS_ALPHA * (chart.fixed_alpha is None)
         part.constant = chart.fixed_alpha or 0.0
     if isinstance(chart, optics.Inverted):
-        part.factor, part.n = _code(chart.factor) or 0, len(chart.parameters)
-        return part if part.factor else None
+        factor = _code(chart.factor)
+        if factor is None:
+            return None
+        part.factor, part.n = factor, len(chart.parameters)
     return part
 
 
 def _stage(stage: Stage) -> structs.Part | None:
-    kind = _code(stage)
+    kind = _code(type(stage))
     if kind is None:
         return None
+    part = structs.Part(kind=kind)
     if isinstance(stage, optics.Surface):
-        part = structs.Part(kind=kind, flags=stage.order, n=stage.columns, m=stage.rows, constant=stage.behind)
+        part.flags, part.n, part.m, part.constant = stage.order, stage.columns, stage.rows, stage.behind
         part.cells[:], part.centre[:] = stage.cells, stage.centre
-        return part
-    if not isinstance(stage, optics.Planar):
-        return structs.Part(kind=kind)
-    flags = structs.TANGENTIAL * bool(stage.tangential) | structs.PRISM * bool(stage.prism)
-    part, radial = structs.Part(kind=kind, flags=flags), stage.radial
+    if isinstance(stage, optics.Planar):
+        part.flags = structs.TANGENTIAL * bool(stage.tangential) | structs.PRISM * bool(stage.prism)
+    radial = stage.radial
     if radial is None:
         return part
-    part.factor, part.n = _code(radial) or 0, len(radial.parameters)
+    factor = _code(type(radial))
+    if factor is None:
+        return None
+    part.factor, part.n = factor, len(radial.parameters)
     if isinstance(radial, optics.Rational):
         part.n, part.m = len(radial.numerator.parameters), len(radial.denominator.parameters)
         if part.n + part.m > structs.MOST_DEGREE:
             return None
     if isinstance(radial, optics.RadiusTable):
         part.n = len(radial.nodes)
-    return part if part.factor else None
+    return part
 
 
 def _constants(lens: Lens) -> Sequence[Tensor]:

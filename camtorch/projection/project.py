@@ -12,7 +12,6 @@ from camtorch.evaluate.tensors import may_branch_on
 from camtorch.optics.charts import Planes3, floor_of
 from camtorch.projection import native_calls
 from camtorch.projection.camera_like import CameraLike
-from camtorch.projection.native_cameras import Native
 from camtorch.projection.rows import CameraRows, Direction, Traced, both, replace, to_mask
 from camtorch.values.arguments import columns
 
@@ -51,11 +50,10 @@ def _formula(
     intrinsics: Tensor,
     distortion: Tensor,
     cameras: CameraRows | None,
-    order: int = 2,
 ) -> tuple[Tensor, Tensor]:
     """Return pixels (2, C, N) for points (C, N, 3), and valid (C, N); see `Direction.formula`."""
     traced = Traced.of(model, intrinsics, distortion, cameras)
-    looks = may_branch_on(points, intrinsics, distortion)
+    looks, order = may_branch_on(points, intrinsics, distortion), order_of(points, intrinsics, distortion)
 
     def evaluate(
         x: Tensor, y: Tensor, z: Tensor, intrinsics: Tensor, distortion: Tensor
@@ -76,13 +74,8 @@ def _formula(
         pixels = torch.stack([replace(seen, w, INVALID_PIXEL) for w in planes])
         return pixels, None if seen is None else seen.expand_as(pixels[0])
 
-    order = order_of(order, points, intrinsics, distortion) if looks else order
     pixels, mask = without_keeping(evaluate, *to_planes(points), traced.intrinsics, traced.distortion)
     return pixels, torch.ones_like(pixels[0], dtype=torch.bool) if mask is None else positive(mask)
 
 
-def _keeping(native: Native, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    return *native_calls.project(native, points), (points,)
-
-
-PROJECT = Direction(_formula, native_calls.project, _keeping, native_calls.project_vjp, "points", 3, 2)
+PROJECT = Direction("points", 3, 2, _formula, native_calls.project, native_calls.project_vjp)

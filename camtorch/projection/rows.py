@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -46,24 +46,28 @@ class CameraRows:
         self._same_on_cpu = None if known is None else CameraRows(model, known[0], known[1])
         self.notes = note(intrinsics), note(distortion)
         first, second = (then if mark is None else then.clone() for then, mark in self.notes)
-        self.given = values = (first[None], second[None]) if intrinsics.ndim == 1 else (first, second)
-        self.usable: Tensor | None = None
-        is_plain = _are_plain(model, *values) if self._same_on_cpu is None else self._same_on_cpu.usable is None
-        if not (is_plain or known_true(usable := _usable(model, *values))):
-            ideal = _ideal(model, *values)
-            values = torch.where(usable, values[0], ideal[0]), torch.where(usable, values[1], ideal[1])
-            self.usable = usable.to(intrinsics.dtype)  # (C, 1)
-        self.intrinsics, self.k = values
+        self.given = (first[None], second[None]) if intrinsics.ndim == 1 else (first, second)
+        self.intrinsics, self.k = self.given
+        self.usable: Tensor | None = None  # (C, 1)
+        are_usable = self._same_on_cpu is not None and self._same_on_cpu.usable is None
+        usable = None if are_usable else _usable_unless_all(model, *self.given)
+        if usable is not None:
+            ideal, ideal_k = _ideal(model, *self.given)
+            self.intrinsics, self.k = torch.where(usable, self.intrinsics, ideal), torch.where(usable, self.k, ideal_k)
+            self.usable = usable.to(intrinsics.dtype)
 
     @cached_property
     def domain(self) -> Domain:
         """The domain in which the lenses are one-to-one; see `Domain`."""
-        if self._same_on_cpu is not None and (native := self._same_on_cpu.native) is not None:
-            made = native.lenses.tables()
-            there = sent([*made.values()], self.k.device) if made else ()
-            by = way_of_inverse(native.plan.is_radial, made.get("stagewise"))
-            return Domain(self.model.optics, self.k, {**dict(zip(made, there, strict=True)), "inverse_by": by})
-        return domain_for(self.model, self.k, self._learns)
+        native = None if self._same_on_cpu is None else self._same_on_cpu.native
+        if native is not None:  # its tables are known on the CPU
+            tables = native.lenses.tables()
+            known: dict[str, Any] = dict(zip(tables, sent([*tables.values()], self.k.device), strict=True))
+            known["inverse_by"] = way_of_inverse(native.plan.is_radial, tables.get("stagewise"))
+            return Domain(self.model.optics, self.k, known)
+        if self._learns:  # and so will not be used again
+            return Domain(self.model.optics, self.k)
+        return domain_of(self.model.operator_name, self.k, self.model.optics)
 
     def as_constant(self) -> CameraRows:
         """Return the same as a constant of an exported program, with all tables that its graph may need."""
@@ -74,8 +78,7 @@ class CameraRows:
     @cached_property
     def native(self) -> Native | None:
         """The cameras in the form of the native geometry; None if that lacks this model, or there is no library."""
-        domain = partial(domain_for, self.model, self.k, self._learns)
-        return native_of(self.model.optics, self.intrinsics, self.k, self.usable, domain, tables=False)
+        return native_of(self.model.optics, self.intrinsics, self.k, self.usable)
 
     def cotangents(self, sums: Tensor | None, wanted: Sequence[bool]) -> tuple[Tensor | None, Tensor | None]:
         """Return the cotangents of intrinsics and distortion, if wanted, for sums of `native_calls.project_vjp`."""
@@ -98,17 +101,6 @@ class CameraRows:
         return of_intrinsics, by_coefficients
 
 
-def single_native(model: type[CameraLike], intrinsics: Tensor, k: Tensor) -> Native | None:
-    """Return a camera of usable numbers (4,) and (n,) for the native geometry; None if that lacks the model."""
-    k = k.detach()[None]
-    return native_of(model.optics, intrinsics[None], k, None, partial(domain_for, model, k, False), tables=True)
-
-
-def domain_for(model: type[CameraLike], k: Tensor, learns: bool) -> Domain:
-    """Return the domain of lenses (C, n) of a model, kept unless they learn, and so will not be used again."""
-    return Domain(model.optics, k) if learns else domain_of(model.operator_name, k, model.optics)
-
-
 def _constant_tables(domain: Domain) -> dict[str, Any]:
     """Return the properties of a domain whose values are known, as far as a graph may need them; none is a view."""
     if not domain.lens.stages:
@@ -124,15 +116,17 @@ def _constant_tables(domain: Domain) -> dict[str, Any]:
     return {**known, "inverse": inverse, "inverse_by": domain.inverse_by}
 
 
-def _are_plain(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> bool:
-    """Whether a short look shows that all are usable."""
-    if not intrinsics.is_cpu or not 0 < intrinsics.numel() + distortion.numel() <= _NUMBERS_LOOKED_AT:
-        return False
-    if distortion.numel() and not model.always_defined and model.defined(distortion.unbind(-1)) is not None:
-        return False
-    rows = intrinsics.tolist()
-    total = math.fsum(map(sum, (*rows, *distortion.tolist())))
-    return math.isfinite(total) and all(fx > 0 and fy > 0 for fx, fy, *_ in rows)
+def _usable_unless_all(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> Tensor | None:
+    """Return `_usable`, or None if a short look shows that all are."""
+    count = intrinsics.numel() + distortion.numel()
+    is_always_defined = model.always_defined or not distortion.numel()
+    if intrinsics.is_cpu and is_always_defined and 0 < count <= _NUMBERS_LOOKED_AT:
+        rows = intrinsics.tolist()
+        total = math.fsum(map(sum, (*rows, *distortion.tolist())))  # not finite if a number is not
+        if math.isfinite(total) and all(fx > 0 and fy > 0 for fx, fy, *_ in rows):
+            return None
+    usable = _usable(model, intrinsics, distortion)
+    return None if known_true(usable) else usable
 
 
 def _usable(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> Tensor:
@@ -168,20 +162,18 @@ def _ideal(model: type[CameraLike], intrinsics: Tensor, distortion: Tensor) -> t
 class Direction(NamedTuple):
     """One direction of cameras (C,) of a model, for rows (C, N, size): as torch records it, and in native code."""
 
-    formula: Callable[..., tuple[Tensor, Tensor]]
-    """The formula: model, rows, intrinsics (C, 4), distortion (C, n), cameras, order to planes (size_out, C, N), valid.
-
-    `cameras` are those of the parameters, if values may be read; derivatives up to `order` must be exact.
-    """
-    native: Callable[[Native, Tensor], tuple[Any, ...]]
-    """The native call, from cameras and rows to planes, valid, and perhaps more."""
-    native_keeping: Callable[[Native, Tensor], tuple[Tensor, Tensor, tuple[Tensor, ...]]]
-    """The native call that also returns the tensors that `native_vjp` needs."""
-    native_vjp: Callable[..., tuple[Tensor | None, Tensor | None]]
-    """The native cotangents of rows and of the numbers of the cameras."""
     name: str  # the rows' name in messages
     size: int
     size_out: int
+    formula: Callable[..., tuple[Tensor, Tensor]]
+    """The formula: model, rows, intrinsics (C, 4), distortion (C, n) and cameras to planes (size_out, C, N) and valid.
+
+    `cameras` are those of the parameters, None if values may not be read.
+    """
+    native: Callable[[Native, Tensor, bool], tuple[Tensor, Tensor, tuple[Tensor, ...]]]
+    """The native call: cameras, rows and whether anything learns to planes, valid and what `native_vjp` then needs."""
+    native_vjp: Callable[..., tuple[Tensor | None, Tensor | None]]
+    """The native cotangents of rows and of the numbers of the cameras."""
 
 
 class Traced(NamedTuple):

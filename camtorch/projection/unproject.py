@@ -19,7 +19,6 @@ from camtorch.optics.lens import newton_step
 from camtorch.optics.radial_inverse import MOST_STEPS, short, solve
 from camtorch.projection import native_calls
 from camtorch.projection.camera_like import CameraLike
-from camtorch.projection.native_cameras import Native
 from camtorch.projection.ops import search_in_place, search_open
 from camtorch.projection.rows import CameraRows, Direction, Traced, both, replace, to_mask
 from camtorch.projection.solve import search
@@ -159,12 +158,11 @@ def _formula(
     intrinsics: Tensor,
     distortion: Tensor,
     cameras: CameraRows | None,
-    order: int = 2,
 ) -> tuple[Tensor, Tensor]:
     """Return rays (3, C, N) for pixels (C, N, 2), and valid (C, N); see `Direction.formula`."""
     traced = Traced.of(model, intrinsics, distortion, cameras)
     domain, looks = traced.domain, may_branch_on(pixels, intrinsics, distortion)
-    order = order_of(order, pixels, intrinsics, distortion)
+    order = order_of(pixels, intrinsics, distortion)
     u, v = to_planes(pixels)
     # the solution has no graph; `attach` gives it derivatives
     (p, q), mask = _to_target(u.detach(), v.detach(), columns(traced.intrinsics.detach()), looks)
@@ -202,10 +200,4 @@ def _formula(
     return rays, torch.ones_like(a, dtype=torch.bool) if mask is None else positive(mask.expand_as(a))
 
 
-def _keeping(native: Native, pixels: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    rays, valid, solution = native_calls.unproject(native, pixels, keeps=True)
-    # a copy, as the returned mask belongs to the caller
-    return rays, valid, (valid.clone(), present(solution, "the solution"))
-
-
-UNPROJECT = Direction(_formula, native_calls.unproject, _keeping, native_calls.unproject_vjp, "pixels", 2, 3)
+UNPROJECT = Direction("pixels", 2, 3, _formula, native_calls.unproject, native_calls.unproject_vjp)

@@ -110,7 +110,7 @@ def test_projects_as_the_formula_does(key, dtype):
             exact = (camera.distortion.double(), moved(camera, 16, 3))
             others = [make(camera.key, camera.intrinsics.double(), k) for k in exact]
             near = [formula_of(other, PROJECT, _moved(p, 64 * eps, seed))[1] for other in others for seed in range(2)]
-        found, found_valid = (w[..., 0, :] for w in geometry.project(native(camera), p[None]))
+        found, found_valid = (w[..., 0, :] for w in geometry.project(native(camera), p[None])[:2])
         found = found.mT
         # next to a fold rounding decides
         sure = torch.stack(near).eq(valid).all(0)
@@ -132,7 +132,7 @@ def test_unprojects_as_the_formula_does(key, dtype):
             exact = make(camera.key, camera.intrinsics.double(), camera.distortion.double())
             around = [formula_of(exact, UNPROJECT, _moved(q, 32 * eps, seed)) for seed in range(2)]
             there = formula_of(exact, UNPROJECT, q.double())[0]
-        rays, found_valid, _ = geometry.unproject(native(camera), q[None], keeps=True)
+        rays, found_valid, _ = geometry.unproject(native(camera), q[None], learns=True)
         rays, found_valid = rays[:, 0].mT, found_valid[0]
         sure = torch.stack([ok for _, ok in around]).eq(valid).all(0)
         assert found_valid[sure & valid].all()
@@ -181,7 +181,7 @@ def test_derivatives_are_those_of_the_formula(key, dtype):
             if direction is PROJECT:
                 by_value, sums = geometry.project_vjp(made, rows, cotangents, True, True)
             else:
-                _, *solved = geometry.unproject(made, rows, keeps=True)
+                *_, solved = geometry.unproject(made, rows, learns=True)
                 by_value, sums = geometry.unproject_vjp(made, *solved, cotangents, True, True)
             found = [by_value[0], sums[0, :4]]
             found += [of_coefficients(camera, sums[0, 4:])] if camera.distortion.numel() else []
@@ -197,7 +197,7 @@ def test_a_row_is_what_it_is_alone(key):
     p = torch.cat((points(torch.float32), fan(100, 300, 80).float()))
     rows = p.flip(0).expand(3, -1, -1)  # one row for all
     with patch.object(geometry, "thread_count", lambda: 3):
-        together, valid = geometry.project(native(batch), rows)
+        together, valid, _ = geometry.project(native(batch), rows)
     for i in range(3):
         alone = type(base)(intrinsics[i], *([base.distortion] if base.distortion.numel() else []))
         found = geometry.project(native(alone), p[None])
@@ -211,7 +211,7 @@ def test_a_row_is_what_it_is_alone(key):
 def test_any_strides_and_threads(key):
     made = native(one(key).float())
     q = pixels(one(key).float()).repeat(40, 1)
-    expected, *solved = geometry.unproject(made, q[None], keeps=True)
+    expected, _, solved = geometry.unproject(made, q[None], learns=True)
     weight = torch.randn(expected.shape, generator=torch.Generator().manual_seed(0))
     cotangents = geometry.unproject_vjp(made, *solved, weight, True, True)
     wide = torch.full((len(q), 7), math.nan)
@@ -219,7 +219,7 @@ def test_any_strides_and_threads(key):
     for rows in (q.mT.contiguous().mT, wide[:, 1:6:4], q.flip(-1).flip(-1)):
         assert geometry.unproject(made, rows[None])[0].equal(expected)
     with patch.object(geometry, "thread_count", lambda: 3):
-        again, *solved = geometry.unproject(made, q[None], keeps=True)
+        again, _, solved = geometry.unproject(made, q[None], learns=True)
         assert again.equal(expected)
         turned = weight.movedim(0, -1).contiguous().movedim(-1, 0)
         found = geometry.unproject_vjp(made, *solved, turned, True, True)
