@@ -3,99 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.utils.parametrize import type_before_parametrizations
 
 from camtorch.calibration.bundle import Adjusted, CameraObservations, Free, Poses, Prior, State, adjust
+from camtorch.calibration.model import Model, as_model
 from camtorch.calibration.observations import Observations, Points, as_observations, repeats
 from camtorch.calibration.robust import Loss, as_loss
 from camtorch.calibration.start import Lens, as_seen, other_cameras, other_poses, poses_for, start_from_nothing
 from camtorch.calibration.uncertainty import shared_factor, spread
 from camtorch.calibration.verdict import Calibration, check_determined
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.camera import as_model as as_kind
-from camtorch.cameras.freezing import INTRINSICS, frozen_names
 from camtorch.least_squares.equations import places_of
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_vector
-from camtorch.values.arguments import as_flag, as_whole, hinting, no_camera, warn
+from camtorch.values.arguments import as_flag, hinting, warn
 from camtorch.values.threads import on_one_thread
 
 STEPS = 300
 _SMOOTH = 0.02  # the weight of a surface's second differences, in px, see `Camera.smoothness`
 _BESIDE = 1e-3  # radians from the axis: the second point that holds a surface's frame
 _AS_GOOD = 9.0  # variances: optima whose costs differ by less are equally good
-
-
-@dataclass(frozen=True)
-class Model:
-    """The camera to find: its class, number of coefficients, start or None, and free parameters."""
-
-    kind: type[Camera]
-    count: int
-    start: Camera | None
-    free: Tensor  # (4 + n,) bool, on the CPU
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return (*INTRINSICS, *(self.kind.names_of(self.count) or ()))
-
-    def camera(self, parameters: Tensor, image_size: tuple[int, int] | None) -> Camera:
-        """Return the camera of parameters (*B, 4 + n), with the same names frozen as in the camera to start from."""
-        found = self.kind(*parameters.split((4, self.count) if self.count else 4, -1))
-        found.image_size = image_size  # set later, as crops may be off centre
-        if self.start is not None and (frozen := frozen_names(self.start)):
-            found.freeze(*frozen)
-        return found
-
-
-def as_model(
-    model: type[Camera] | str | Camera,
-    count: int | None,
-    start: Camera | None,
-    fixed: Collection[str] | str,
-    owner: str,
-) -> Model:
-    """Return the camera that the arguments of `calibrate` ask for."""
-    if isinstance(model, Camera):
-        if start is not None:
-            raise ValueError(f"{owner}: start must be left out if model is a camera; got {start!r}")
-        start, model = model, type_before_parametrizations(model)
-    model = as_kind(model, owner)
-    if start is not None:
-        if not isinstance(start, Camera):
-            raise TypeError(f"{owner}: start must be a camera; got {no_camera(start)}")
-        is_other = type_before_parametrizations(start) is not model
-        if is_other and model.smoothness() is not None and not start.batch_shape:
-            start, is_other = start.convert(model).camera, False
-        if is_other or start.batch_shape.numel() != 1:
-            raise ValueError(
-                f"{owner}: start must be one {model.__name__}, as start.convert({model.__name__}).camera is; got "
-                f"{type(start).__name__} with batch_shape={tuple(start.batch_shape)}"
-            )
-        if count not in (None, start.distortion.shape[-1]):
-            raise ValueError(f"{owner}: count must be that of the start, {start.distortion.shape[-1]}; got {count}")
-        count = start.distortion.shape[-1]
-    count = model.default_count if count is None else as_whole(count, "count", owner)
-    if (names := model.names_of(count) if 0 <= count <= max(100, model.default_count) else None) is None:
-        raise ValueError(f"{owner}: count must fit {model.__name__}, {model.counts_text()}; got {count}")
-    names = (*INTRINSICS, *names)
-    if not isinstance(fixed, Collection) or isinstance(fixed, Mapping):
-        raise TypeError(f'{owner}: fixed must be names of parameters, as ("cx", "cy"), or "all"; got {fixed!r}')
-    fixed = (names if fixed == "all" else (fixed,)) if isinstance(fixed, str) else tuple(fixed)
-    if unknown := [name for name in fixed if name not in names]:
-        raise ValueError(f"{owner}: fixed must name parameters of {model.__name__}, {', '.join(names)}; got {unknown}")
-    if start is not None:
-        fixed = *fixed, *frozen_names(start), *(INTRINSICS if model.smoothness() is not None else ())
-    elif {"fx", "fy"} & set(fixed):
-        raise ValueError(f"{owner}: start must be a camera if fx or fy is fixed; got None")
-    return Model(model, count, start, torch.tensor([name not in fixed for name in names], device="cpu"))
 
 
 @on_one_thread
@@ -211,9 +144,8 @@ class Search:
                 'its lens; got None. Pass start=calibrate("kannala_brandt", ...).camera'
             )
         if asked.start is None:
-            fixed = [name for name, free in zip(asked.names, asked.free.tolist(), strict=True) if not free]
             with torch.inference_mode():  # takes a tenth less time, and no graph needs the result
-                first = start_from_nothing(seen, asked.kind, asked.count, fixed, self.loss)
+                first = start_from_nothing(seen, asked, self.loss)
             first = first.of(torch.arange(1, device=seen.pixels.device))
         else:
             given = torch.cat([t.detach().to(seen.pixels).reshape(1, -1) for t in asked.start.tensors], -1)
@@ -235,7 +167,7 @@ class Search:
         """Return the best optimum of this model's basins, if it has several."""
         state = adjusted.state
         lens = Lens(self.asked.kind, state.parameters[camera], state.boards_from(camera))
-        starts = other_cameras(lens, free.parameters[camera].cpu(), self.centred)
+        starts = other_cameras(lens, self.asked, self.centred)
         if starts is None:
             return adjusted
         first = state.of(torch.zeros(len(starts), dtype=torch.long, device=starts.device))

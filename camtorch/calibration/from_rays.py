@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import torch
 from torch import Tensor
 
-from camtorch.calibration.calibrate import as_model
+from camtorch.calibration.model import as_model
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import fixed_camera
 from camtorch.convert import fitting, views

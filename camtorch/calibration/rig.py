@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from camtorch.calibration.bundle import Bundle, CameraObservations, Free, Poses, State, adjust
-from camtorch.calibration.calibrate import STEPS, Search, as_model, extrinsics_of, middle_of, results
+from camtorch.calibration.calibrate import STEPS, Search, extrinsics_of, middle_of, results
+from camtorch.calibration.model import as_model
 from camtorch.calibration.observations import Points, as_rig_observations
 from camtorch.calibration.robust import Loss, as_loss
 from camtorch.calibration.uncertainty import shared_factor

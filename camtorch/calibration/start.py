@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from camtorch.calibration.bundle import SETTLED, Adjusted, CameraObservations, Free, Poses, Prior, State, adjust, minima
+from camtorch.calibration.model import Model
 from camtorch.calibration.observations import Observations
 from camtorch.calibration.rays import poses_from_rays
-from camtorch.calibration.robust import LEAST_SQUARES, Loss
+from camtorch.calibration.robust import Loss
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.freezing import INTRINSICS
 from camtorch.cameras.operators import fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.models import UCM, KannalaBrandt
@@ -57,27 +57,21 @@ _OTHER = 0.05  # radians, or part of the distance: poses further apart are two m
 _LOST = 0.01  # the part of the corners without a pixel above which a model is wrong
 
 
-def start_from_nothing(
-    observations: Observations,
-    model: type[Camera],
-    count: int,
-    fixed: Collection[str] = (),
-    loss: Loss = LEAST_SQUARES,
-) -> State:
+def start_from_nothing(observations: Observations, asked: Model, loss: Loss) -> State:
     """Return a camera of the model, B = 1, and the poses of all views, from which an adjustment reaches the optimum.
 
     Unified cameras of many widths are ranked by the errors of the poses that their rays give in closed form. The best
-    few are refined with a Cauchy loss, and the model is fitted to the best one from several starts. Parameters in
-    `fixed` are held: coefficients as in `Camera.ideal`, the principal point in the middle of the image.
+    few are refined with a Cauchy loss, and the model is fitted to the best one from several starts. Fixed parameters
+    are held: coefficients as in `Camera.ideal`, the principal point in the middle of the image.
     """
-    few, free = _subsample(observations), _free_parameters(model, count, fixed)
-    lens = first = _find_unified(few, fixed)
-    bounds = [model.fit_bounds.get(name, ()) for name in model.names_of(count) or ()]
-    if bounds and all(ends is None for ends in bounds):
+    few, free = _subsample(observations), _free_parameters(asked)
+    lens = first = _find_unified(few, asked.fixed)
+    if asked.count and all(asked.kind.fit_bounds.get(name, ()) is None for name in asked.names[4:]):
         # a model that keeps its start's shape takes that of a good lens
-        good = _fit_model(lens, few, KannalaBrandt, 4, fixed)
-        lens = _refine(good, few, _free_parameters(KannalaBrandt, 4, fixed), Loss("cauchy", lens.scale)).of(slice(1))
-    lens = _fit_model(lens, few, model, count, fixed)
+        good = Model(KannalaBrandt, 4, asked.fixed)
+        fitted = _fit_model(lens, few, good)
+        lens = _refine(fitted, few, _free_parameters(good), Loss("cauchy", lens.scale)).of(slice(1))
+    lens = _fit_model(lens, few, asked)
     if few is not observations or len(lens.parameters) > 1 or bool(lens.lost(few).any()):
         lens = _refine(lens, few, free, loss)
         one = lens.of(slice(1))
@@ -92,7 +86,7 @@ def start_from_nothing(
     if len(lens.parameters) == 1:
         return state
     lens = lens._replace(boards=state.boards.expand(len(lens.parameters)))
-    observed = [as_seen(model, observations)]
+    observed = [as_seen(asked.kind, observations)]
     found = adjust(observed, lens.state, free, loss=loss, steps=_MANY_STEPS)
     return found.state.of(found.cost.argmin()[None])
 
@@ -122,16 +116,12 @@ def other_poses(found: Adjusted, observations: Observations, model: type[Camera]
     return state._replace(boards=state.boards.with_views(rows, Poses.where(is_other[0], others, boards)))
 
 
-def other_cameras(lens: Lens, learns: Tensor, observations: Observations) -> Tensor | None:
+def other_cameras(lens: Lens, asked: Model, observations: Observations) -> Tensor | None:
     """Return cameras (S, 4 + n) fitted from starts along the model's valley, see `_ALONG`, or None if it has none."""
-    count = lens.parameters.shape[-1] - 4
-    names = (*INTRINSICS, *(lens.model.names_of(count) or ()))
-    along, _ = _ALONG.get(lens.model.key, ("", ()))
-    if not along or not bool(learns[names.index(along)]):
+    if asked.kind.key not in _ALONG or _ALONG[asked.kind.key][0] in asked.fixed:
         return None
-    fixed = [name for name, is_free in zip(names, learns.tolist(), strict=True) if not is_free]
-    found = _fit_model(lens, observations, lens.model, count, fixed).parameters
-    return torch.where(learns.to(found.device), found, lens.parameters)
+    found = _fit_model(lens, observations, asked).parameters
+    return torch.where(asked.free.to(found.device), found, lens.parameters)
 
 
 class Lens(NamedTuple):
@@ -179,11 +169,10 @@ def as_seen(model: type[Camera], observations: Observations, prior: Prior | None
     return CameraObservations(model, points[None], pixels[None], weights[None], prior)
 
 
-def _free_parameters(model: type[Camera], count: int, fixed: Collection[str]) -> Free:
-    """Return the parameters that learn: all except those held by `fixed` or by the model."""
-    names = (*INTRINSICS, *(model.names_of(count) or ()))
-    learns = [name not in fixed and model.fit_bounds.get(name, ()) is not None for name in names]
-    return Free((torch.tensor(learns, device="cpu"),))
+def _free_parameters(asked: Model) -> Free:
+    """Return the parameters that learn: all except those that are fixed, or that the model keeps."""
+    kept = torch.tensor([asked.kind.fit_bounds.get(name, ()) is None for name in asked.names], device="cpu")
+    return Free((asked.free & ~kept,))
 
 
 def _subsample(observations: Observations) -> Observations:
@@ -227,7 +216,7 @@ def _find_unified(few: Observations, fixed: Collection[str]) -> Lens:
         rows = rows[score <= unlike * score[0]]
         lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(score[0]))).of(rows)
         begun = lens.boards, errors[rows]
-    free = _free_parameters(UCM, 1, [name for name in fixed if name in ("cx", "cy")])
+    free = _free_parameters(Model(UCM, 1, tuple(name for name in fixed if name in ("cx", "cy"))))
     lens = lens.adjusted(few, free, _STEPS, _WORSE).of(slice(1))
     return _choose_poses(lens, few, _errors(lens.camera, lens.boards, few))
 
@@ -334,47 +323,52 @@ def _refine(lens: Lens, few: Observations, free: Free, loss: Loss) -> Lens:
     return lens if len(lens.parameters) == 1 else lens.adjusted(few, free, _MANY_STEPS, _LITTLE_WORSE, loss)
 
 
-def _fit_model(lens: Lens, few: Observations, model: type[Camera], count: int, fixed: Collection[str]) -> Lens:
+def _fit_model(lens: Lens, few: Observations, asked: Model) -> Lens:
     """Fit cameras (S,) of another model to the corners, with the boards held."""
-    camera = lens.camera
+    model, camera = asked.kind, lens.camera
     slopes = views.focal_at_axis(camera)
     rays = torch.nn.functional.normalize(lens.boards.moved(few.points), dim=-1)
     inliers = few.seen & (_errors(camera, lens.boards, few) < 3 * lens.scale)
     reach = torch.where(inliers, angles_from_axis(rays), 0.0).amax((-1, -2))
-    names = model.names_of(count) or ()
-    ideal = slopes.new_tensor(model.ideal(count))
+    ideal = slopes.new_tensor(model.ideal(asked.count))
     starts = ideal[None]
-    if names:
-        starts = model.fit_start(names, *views.radii(camera, slopes, (_REACH * reach).clamp(max=math.pi)))[:, 0]
-    is_fixed = torch.tensor([name in fixed for name in names], dtype=torch.bool, device=slopes.device)
-    starts = torch.where(is_fixed, ideal, starts)
-    sets = [(starts, is_fixed)]  # with the coefficients that are held
-    along, values = _ALONG.get(model.key, ("", ()))
-    order = torch.arange(len(names), device=slopes.device)
-    if values and along not in fixed:
-        at = names.index(along)
-        more = starts[:1].repeat(len(values), 1)
-        more[:, at] = more.new_tensor(values)
-        sets.append((more, is_fixed | (order == at)))
-    if not values:
-        sets += [(starts[:1], is_fixed | (order >= low)) for low in _LOW_ORDERS if len(names) > low]
-    begun = torch.cat([some for some, _ in sets])
-    held = torch.cat([torch.where(stays, some, torch.nan) for some, stays in sets])
-    held = torch.nn.functional.pad(held, (4, 0), value=torch.nan)
-    template = fixed_camera(model, slopes[:1], ideal[None])
+    if asked.count:
+        by_radii = views.radii(camera, slopes, (_REACH * reach).clamp(max=math.pi))
+        starts = model.fit_start(asked.names[4:], *by_radii)[:, 0]
+    begun, held = _coefficients_to_try(asked, starts, ideal)
     seen = fitting.Observations(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
     seen = fitting.Observations(*(t.expand(len(begun), *t.shape[1:]) for t in seen))
+    template = fixed_camera(model, slopes[:1], ideal[None])
     slopes = slopes.expand(len(begun), -1)
     ones = slopes.new_tensor([1.0, 1.0, 0.0, 0.0]).expand_as(slopes)
     focal = slopes[:, :2] / views.focal_at_axis(fixed_camera(model, ones, begun))[:, :2].clamp(min=_LEAST_SLOPE)
     parameters = torch.cat((focal, slopes[:, 2:], begun), -1)
     _, valid = fixed_camera(model, parameters[:, :4], begun).project(seen.rays)
-    if values or not bool((valid | (seen.weights == 0)).all()):
+    if model.key in _ALONG or not bool((valid | (seen.weights == 0)).all()):
         parameters = fitting.fit(template, seen, begun[None], slopes, fixed=held)
     # cameras that nearly equal an earlier one are dropped
     apart = (parameters[:, None] - parameters).abs() > _ALIKE * (parameters.abs() + _ALIKE)
     parameters = parameters[~(~apart.any(-1)).tril(-1).any(-1)]
     for i, name in enumerate(("cx", "cy")):
-        if name in fixed:
+        if name in asked.fixed:
             parameters[:, 2 + i] = _middle(few)[i]
     return lens._replace(model=model, parameters=parameters, boards=lens.boards.expand(len(parameters)))
+
+
+def _coefficients_to_try(asked: Model, starts: Tensor, ideal: Tensor) -> tuple[Tensor, Tensor]:
+    """Return coefficients (S, n) to start from, and (S, 4 + n) the values of those that are held, NaN for others."""
+    names, model = asked.names[4:], asked.kind
+    is_fixed = torch.tensor([name in asked.fixed for name in names], dtype=torch.bool, device=starts.device)
+    starts = torch.where(is_fixed, ideal, starts)
+    sets = [(starts, is_fixed)]
+    order = torch.arange(len(names), device=starts.device)
+    if model.key not in _ALONG:
+        sets += [(starts[:1], is_fixed | (order >= low)) for low in _LOW_ORDERS if len(names) > low]
+    elif _ALONG[model.key][0] not in asked.fixed:
+        along, values = _ALONG[model.key]
+        more = starts[:1].repeat(len(values), 1)
+        more[:, names.index(along)] = more.new_tensor(values)
+        sets.append((more, is_fixed | (order == names.index(along))))
+    begun = torch.cat([some for some, _ in sets])
+    held = torch.cat([torch.where(stays, some, torch.nan) for some, stays in sets])
+    return begun, torch.nn.functional.pad(held, (4, 0), value=torch.nan)

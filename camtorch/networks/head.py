@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from camtorch.calibration.calibrate import as_model
+from camtorch.calibration.model import as_model
 from camtorch.cameras.camera import Camera
 from camtorch.networks.limits import Limits
 from camtorch.networks.prior import prior_of

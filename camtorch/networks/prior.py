@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from camtorch.calibration.calibrate import Model
+from camtorch.calibration.model import Model
 from camtorch.cameras.camera import Camera
 from camtorch.networks.limits import BEYOND
 from camtorch.rays.lattices import focal_for
