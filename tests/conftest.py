@@ -26,6 +26,8 @@ def pytest_collection(session):
         # forward-mode derivatives load it on first use, and it uses the deprecated torch.jit.script
         warnings.simplefilter("ignore")
         import torch._decomp.decompositions_for_jvp
+    if not torch.accelerator.is_available():  # torch's own keeps a traceback for each kind of device: a millisecond
+        torch.manual_seed = torch.default_generator.manual_seed
     # xdist has a process on every core already
     torch.set_num_threads(1)
     # the same examples on every machine and in every run; speed is not what these tests are about
@@ -51,7 +53,7 @@ def _random_numbers_are_the_same():
 
     random.seed(0)
     np.random.seed(0)
-    torch.default_generator.manual_seed(0)  # torch.manual_seed asks every kind of device, which takes a millisecond
+    torch.manual_seed(0)
 
 
 @pytest.fixture(autouse=True)

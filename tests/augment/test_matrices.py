@@ -69,8 +69,10 @@ def check_labels(out, name="K"):
     assert off.numel() == 0 or off.abs().max() < 0.01
 
 
-@pytest.mark.parametrize("dims", [3, 4])
-@pytest.mark.parametrize("field", ["K", "intrinsics", "camera_matrix", "of_cam"])
+# of the names, each in either shape, and of either name that is written, both
+@pytest.mark.parametrize(
+    ("field", "dims"), [("K", 3), ("K", 4), ("intrinsics", 4), ("camera_matrix", 3), ("of_cam", 4)]
+)
 @pytest.mark.parametrize("name", AUGMENTATIONS)
 def test_new_matrices_project_points_on_their_pixels(name, field, dims):
     augment = AUGMENTATIONS[name](fields={"of_cam": "K"})

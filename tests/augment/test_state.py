@@ -2,6 +2,7 @@
 
 import ast
 import copy
+import functools
 import inspect
 import io
 import pickle
@@ -117,6 +118,7 @@ def made(name, **changes):
     return kind(**{"camera": camera(), "fields": {"more": "keep"}, **options, **changes})
 
 
+@functools.cache
 def sample(count=None):
     torch.manual_seed(0)
     fields = {

@@ -208,8 +208,7 @@ def test_derivatives(key, camera_of, method):
 
 
 @every_model
-@pytest.mark.parametrize("offset", [0.0, 1e-300, 1e-12, 1e-7])
-def test_derivatives_at_the_axis(key, offset):
+def test_derivatives_at_the_axis(key):
     """On the axis a camera without even terms is a pinhole camera, first derivatives included."""
     camera = spread(key)
     # a table has its slope in the lens
@@ -219,8 +218,9 @@ def test_derivatives_at_the_axis(key, offset):
     zero = torch.zeros((), dtype=torch.float64)
     ((ua, ub), (va, vb)) = jacfwd(lambda m: torch.stack(lens(m[0], m[1])))(torch.stack((zero, zero)))
     expected = torch.tensor([[fx * ua, fx * ub, 0], [fy * va, fy * vb, 0]], dtype=torch.float64)
-    result = jacrev(lambda p: camera.project(p)[0])(torch.tensor([offset, -offset, 1.0], dtype=torch.float64))
-    torch.testing.assert_close(result.detach(), expected, rtol=0, atol=fx * (1e-12 + 4 * offset))
+    for offset in (0.0, 1e-300, 1e-12, 1e-7):
+        result = jacrev(lambda p: camera.project(p)[0])(torch.tensor([offset, -offset, 1.0], dtype=torch.float64))
+        torch.testing.assert_close(result.detach(), expected, rtol=0, atol=fx * (1e-12 + 4 * offset))
 
 
 # -- what is not valid

@@ -271,6 +271,7 @@ def test_heads_export_with_any_number_of_rows(model):
     torch.testing.assert_close(program(features), module(features))
 
 
+@pytest.mark.slow
 def test_the_error_of_an_export_to_onnx_says_what_exports():
     pytest.importorskip("onnxscript")
     head = ct.CameraHead(4, "brown_conrady", image_size=(48, 64)).eval()
