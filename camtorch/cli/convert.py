@@ -17,7 +17,8 @@ def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     if (arguments.new is None) == (arguments.output is None):
         raise ValueError("the new file must be given. Write camtorch convert IN -o OUT")
-    if not (path := arguments.new or arguments.output).is_dir():  # some formats are folders
+    path = arguments.new or arguments.output
+    if not path.is_dir():  # some formats are folders
         targets.check(path, force=arguments.force, inputs=_read(arguments.input))
     angle = arguments.max_angle
     if angle is not None and not 0 < angle <= 180:

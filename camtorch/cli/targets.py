@@ -111,7 +111,8 @@ def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, forc
         written[place] = source
     if resume:
         return [(source, target) for source, target in pairs if not (target.is_file() and target.stat().st_size)]
-    if (there := [target for _, target in pairs if os.path.lexists(target)]) and not force:
+    there = [target for _, target in pairs if os.path.lexists(target)]
+    if there and not force:
         more = f", and {len(there) - 1} more of {len(pairs)}" if len(there) > 1 else ""
         hint = "--resume continues the run, --force overwrites"
         raise ValueError(f"{there[0]}: exists already{more}; {hint}")

@@ -93,7 +93,8 @@ def _camera(record: Record) -> Camera:
     if names and list(kind.names_of(len(names)) or ()) != names:
         record["distortion_names"].fail(f"must be names of {kind.__name__}, {kind.counts_text()}; got {names!r:.60}")
     distortion = _tensor(record["distortion"], len(names)) if names or "distortion" in record else intrinsics[..., :0]
-    if "distortion" in record and kind.names_of(count := distortion.shape[-1]) is None:
+    count = distortion.shape[-1]
+    if "distortion" in record and kind.names_of(count) is None:
         record["distortion"].fail(f"must have coefficients {kind.counts_text()} for {kind.__name__}; got {count}")
     size = None
     if "image_size" in record:

@@ -33,7 +33,8 @@ def read(path: str, content: bytes) -> Rig:
     if len(content) > _LARGEST_FILE:
         raise CameraFileError(path, "size", f"must be at most {_LARGEST_FILE} bytes; got {len(content)}")
     lines = [line.split() for line in decoded(path, content).splitlines()]
-    if len(rows := [line for line in lines if line and not line[0].startswith("#")]) < len(_LINES):
+    rows = [line for line in lines if line and not line[0].startswith("#")]
+    if len(rows) < len(_LINES):
         raise CameraFileError(path, _LINES[len(rows)], "must be given; got no such line")
     record = Record(path, dict(zip(_LINES, rows, strict=False)))
     polynomial, inverse, centre, affine, size = (record[name] for name in _LINES)

@@ -12,6 +12,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
+from itertools import takewhile
 from typing import Any, NoReturn
 from xml.etree import ElementTree
 
@@ -229,24 +230,28 @@ def _document(path: Path, events: Iterator[Any]) -> Any:
             fail(event, f"tags must be of keys and values, as nothing is constructed here; got {event.tag!r:.80}")
         if depth > _DEEPEST:
             fail(event, "nested too deeply")
+        found = (event.value, 1) if kind == "ScalarEvent" else inside(kind == "SequenceStartEvent", depth + 1)
+        if event.anchor:
+            anchors[event.anchor] = found
+        return found
+
+    def inside(is_list: bool, depth: int) -> tuple[Any, int]:
+        """Return the list or the mapping of the next events, up to its end, and how many values it has with itself."""
         items, keys, size = list[Any](), dict[str, Any](), 1
-        while kind != "ScalarEvent" and not type(item := next(events)).__name__.endswith("EndEvent"):
-            value, more = value_of(item, depth + 1)
+        for item in takewhile(lambda one: not type(one).__name__.endswith("EndEvent"), events):
+            value, more = value_of(item, depth)
             size += more
-            if kind == "SequenceStartEvent":
+            if is_list:
                 items.append(value)
             elif isinstance(value, str) and value not in keys:
-                keys[value], more = value_of(next(events), depth + 1)
+                keys[value], more = value_of(next(events), depth)
                 size += more
             else:
                 twice = f"{value!r:.60} twice" if isinstance(value, str) else "a list or a mapping"
                 fail(item, f"keys must be text, and unique; got {twice}")
             if size > _MOST_VALUES:
                 fail(item, f"must have at most {_MOST_VALUES} values; got more")
-        found = event.value if kind == "ScalarEvent" else items if kind == "SequenceStartEvent" else keys, size
-        if event.anchor:
-            anchors[event.anchor] = found
-        return found
+        return (items if is_list else keys), size
 
     values = [value_of(event, 0)[0] for event in events if hasattr(event, "anchor")]
     if any(values[1:]):

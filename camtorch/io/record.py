@@ -175,7 +175,8 @@ class Record:
         """Return the camera of a model of `camtorch.MODELS`, in float64; `lens` is the place of its distortion."""
         kind = self.model(key)
         first, second = (torch.as_tensor(values, dtype=torch.float64) for values in (intrinsics, distortion))
-        if (count := second.shape[-1]) and not kind.names_of(count):
+        count = second.shape[-1]
+        if count and not kind.names_of(count):
             there = self if lens is None else lens
             there.fail(f"{kind.__name__} must have coefficients {kind.counts_text()}; got {count}")
         try:

@@ -76,7 +76,8 @@ def warn_if_missing() -> None:
     from camtorch.values.arguments import warn
 
     _told.add(state())
-    if (worker := get_worker_info()) is None or worker.id == 0:
+    worker = get_worker_info()
+    if worker is None or worker.id == 0:
         warn(f"camtorch's compiled library is {state()}. CAMTORCH_NATIVE=0 in the environment silences this")
 
 

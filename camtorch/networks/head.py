@@ -90,7 +90,8 @@ class CameraHead(GeometryModule):
             raise ValueError(f"{owner}: fixed must not name fx, fy or all; got {fixed!r}. Use fov=(90, 90)")
         asked = as_model(model, count, None, fixed, owner)
         known = None if asked.start is None else asked.start.image_size
-        if (size := as_image_size(image_size, owner) or known) is None:
+        size = as_image_size(image_size, owner) or known
+        if size is None:
             raise ValueError(f"{owner}: image_size must be given; got None. Pass image_size=(height, width)")
         if known not in (None, size):
             raise ValueError(f"{owner}: image_size must be that of the camera, {known}; got {size}")
@@ -175,8 +176,8 @@ class CameraHead(GeometryModule):
             centre = centre + torch.zeros_like(centre).index_copy(1, index, moved)
         intrinsics = torch.cat((focal * (-half).exp(), focal * half.exp(), centre), -1).to(dtype)
         lead = numbers.shape[:-1]
-        parts = [intrinsics.reshape(*lead, 4), k.to(dtype).reshape(*lead, len(lens))][: 2 if len(lens) else 1]
-        camera = self.model(*parts, image_size=self.image_size)
+        distortion = k.to(dtype).reshape(*lead, len(lens)) if len(lens) else None
+        camera = self.model(intrinsics.reshape(*lead, 4), distortion, image_size=self.image_size)
         return camera.requires_grad_(False) if isinstance(camera.intrinsics, nn.Parameter) else camera
 
     def _moves(self, limits: Limits, numbers: Tensor, disc: Tensor) -> Tensor:
