@@ -29,7 +29,8 @@ def run(arguments: argparse.Namespace) -> None:
     cameras = _cameras(arguments)
     path = arguments.output
     targets.check(path, force=arguments.force, inputs=tuple(one for paths in cameras.values() for one in paths))
-    if {"fx", "fy"} & set((arguments.fixed or "").split(",")):
+    fixed = tuple(filter(None, (arguments.fixed or "").split(",")))
+    if {"fx", "fy"} & set(fixed):
         raise ValueError("--fixed: must not name a focal length; got one. In Python write ct.calibrate(start=camera)")
     candidates = _candidates(arguments)
     if arguments.board is None:
@@ -42,10 +43,10 @@ def run(arguments: argparse.Namespace) -> None:
     views, sizes = find_views(cameras, board, "" if arguments.square is None else "m")
     if arguments.square is None:
         note("no --square is given: distances are in sides of a square")
-    fixed = tuple(filter(None, (arguments.fixed or "").split(",")))
     options: dict[str, Any] = {"fixed": fixed, "loss": arguments.loss, "loss_scale": arguments.loss_scale}
-    points, pixels, models, counts = board.points(), {}, {}, {}
+    points = board.points()
     unseen = np.full((len(points), 2), np.nan)
+    pixels, models, counts = {}, {}, {}
     for name, size in sizes.items():
         pixels[name] = np.stack([of_view[name].pixels if name in of_view else unseen for of_view in views.values()])
         models[name], counts[name] = candidates[0]
@@ -72,17 +73,27 @@ def run(arguments: argparse.Namespace) -> None:
     if not result.converged:
         hint = "nothing is written. Check --board and the images, or try another --model, or --loss huber"
         raise ValueError(f"the calibration must converge; got rms {result.rms:.4g} px, {hint}")
-    text = repr(result)  # with names of views instead of numbers, and options instead of arguments
-    numbered = r"\b([Vv]iews? )(\d+(?:, \d+)*)"
-    text = re.sub(numbered, lambda m: m[1] + re.sub(r"\d+", lambda n: names[int(n[0])], m[2]), text)
-    text = re.sub(r'fixed=\("(.*?)",?\)', lambda m: f"--fixed {m[1].replace(chr(34), '').replace(' ', '')}", text)
-    print(re.sub(r"count=(\d+)", r"--count \1", text.replace("bend=True", "--bend")))
+    print(_told(result, names))
     if arguments.bend:
         across, down = (f"{bend:.3g}" for bend in result.bend)
         print(f"board: its middle lies {across} off its left and right, {down} off its top and bottom")
     path.parent.mkdir(parents=True, exist_ok=True)
     formats.save(made, path, arguments.format)
     print(f"{path}: {what}")
+
+
+def _told(result: Calibration | RigCalibration, names: list[str]) -> str:
+    """Return a result in words, with names of views instead of numbers, and options instead of arguments."""
+
+    def named(numbers: re.Match[str]) -> str:
+        return numbers[1] + re.sub(r"\d+", lambda number: names[int(number[0])], numbers[2])
+
+    def option(fixed: re.Match[str]) -> str:
+        return "--fixed " + re.sub('[ "]', "", fixed[1])
+
+    text = re.sub(r"\b([Vv]iews? )(\d+(?:, \d+)*)", named, repr(result))
+    text = re.sub(r'fixed=\("(.*?)",?\)', option, text)
+    return re.sub(r"count=(\d+)", r"--count \1", text.replace("bend=True", "--bend"))
 
 
 def _cameras(arguments: argparse.Namespace) -> dict[str, list[Path]]:

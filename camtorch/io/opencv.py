@@ -221,7 +221,8 @@ def _add_camera(lossy: Lossy, values: dict[str, Any], name: str, camera: Camera,
     if key == "kannala_brandt":
         distortion = lossy.at_most(name, camera, distortion, (_FISHEYE_COUNT,))
     if key == "mei":
-        values[f"xi_{end}" if end else "xi"], *distortion = distortion
+        values[f"xi_{end}" if end else "xi"] = distortion[0]
+        distortion = distortion[1:]
     fisheye = int(key == "kannala_brandt")
     # one flag holds for all cameras, so they must agree even if some do not need it
     says = key != "mei" and (fisheye or len(distortion) == _FISHEYE_COUNT or end)

@@ -115,14 +115,14 @@ def columns() -> tuple[dict[str, list[str]], NDArray[np.float64]]:
 def entries() -> tuple[Lens, ...]:
     """Return all lenses, in the order of the collection."""
     texts, numbers = columns()
-    stated = ([float(text) if text else None for text in texts[name]] for name in _TEXTS[6:9])
-    rows = zip(*(texts[name] for name in _TEXTS[:6]), *stated, texts["digital_lens"], numbers.T.tolist(), strict=True)
+    names = zip(*(texts[name] for name in _TEXTS[:4]), strict=True)
+    sizes = zip(map(int, texts["height"]), map(int, texts["width"]), strict=True)
+    readouts, across, down = ([float(text) if text else None for text in texts[name]] for name in _TEXTS[6:9])
+    stretches = zip(across, down, strict=True)
+    rows = zip(names, sizes, numbers.T.tolist(), readouts, stretches, texts["digital_lens"], strict=True)
     return tuple(
-        Lens(
-            *(brand, body, lens, setting, (int(height), int(width)), tuple(values[:4]), tuple(values[4:8]), values[8]),
-            *(readout, (across, down), digital),
-        )
-        for brand, body, lens, setting, width, height, readout, across, down, digital, values in rows
+        Lens(brand, body, lens, setting, size, tuple(each[:4]), tuple(each[4:8]), each[8], readout, stretch, digital)
+        for (brand, body, lens, setting), size, each, readout, stretch, digital in rows
     )
 
 
