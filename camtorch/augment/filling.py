@@ -17,7 +17,7 @@ from camtorch.poses.rotations import rotation_matrix, rotation_vector
 from camtorch.values.arguments import TOLD, broadcast_shapes, warn
 from camtorch.values.module import remade
 from camtorch.warp.boxes import along_edges
-from camtorch.warp.grid import Between
+from camtorch.warp.grid import CameraPair
 
 _ROOT = 1.324717957244746  # plastic number: a low-discrepancy sequence in 2D (R2)
 _SHARE_ERROR = 0.01  # largest error of the share that points measure
@@ -56,7 +56,7 @@ def _part_shown(
         centre = target.intrinsics[..., None, 2:]
         pixels = centre + (pixels - centre) / zoom[..., None, None]
     pixels = pixels.expand(*broadcast_shapes(*shapes), *pixels.shape[-2:])
-    _, shown = Between(source, target, rotation).back.move(pixels, on_image=True)
+    _, shown = CameraPair(source, target, rotation).back.move(pixels, on_image=True)
     part = shown[..., :SPREAD].to(pixels.dtype).mean(-1)
     return torch.where(shown[..., SPREAD:].all(-1), part, part.clamp(max=NEARLY_FILLED))
 

@@ -20,11 +20,11 @@ from camtorch.poses.rotations import transposed
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
-from camtorch.warp.camera_pair import Route
 from camtorch.warp.grid import placed
 from camtorch.warp.lattice import PixelPositions, Positions, coarse, straight_lattice
 from camtorch.warp.options import Options, PaddingMode, Sampler
 from camtorch.warp.panorama import lengths
+from camtorch.warp.routes import Route
 from camtorch.warp.sampling import SHRINKS, render
 from camtorch.warp.warp import Warp
 
@@ -69,7 +69,7 @@ class UncheckedWarp(Warp):
         if called and self._edits_need_values(smooth) and not keeps_graph(images, *self.tensors):
             options = self.antialias, sampler.padding_mode, sampler
             matrix = None if self.map is None else map_as_tensor(self.map)
-            return compiled.warped(images, self.ends, self.tolerance, *options, matrix, _edited)
+            return compiled.warped(images, self.pair, self.tolerance, *options, matrix, _edited)
         route = route or self.route(images)
         edits = None if in_transform() else self._edits(sampler, smooth, route)
         if not edits:

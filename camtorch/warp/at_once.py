@@ -20,9 +20,9 @@ from camtorch.projection.evaluation import native_forms
 from camtorch.projection.native_calls import Lattices, NativeMove, run_and_follow
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
-from camtorch.warp.camera_pair import CameraPair
 from camtorch.warp.lattice import FEWEST_CELLS, MOST_KEPT_NODES, coarse, probes
 from camtorch.warp.options import Options, Sampler, serving_all
+from camtorch.warp.routes import RoutedWarp
 from camtorch.warp.sampling import SHRINKS, SURELY
 
 Label = Literal["pixels", "boxes", "rays", "columns", "pose", "rotation vectors"]
@@ -30,8 +30,8 @@ Label = Literal["pixels", "boxes", "rays", "columns", "pose", "rotation vectors"
 of which those of a pose begin with a rotation; or rotation vectors."""
 MovedField = tuple[Tensor, Tensor | None]
 """A value after a move, and which of it is valid, if it has validity."""
-Reader = Callable[[Tensor, int], MovedField]
-"""Has C read a value, and returns its results; the number is the step from one camera's turn to the next one's."""
+Reader = Callable[[Tensor], MovedField]
+"""Has C read a value, and returns its results."""
 Sizes = tuple[tuple[int, int], tuple[int, int]]  # (height, width) of the source's image, and of the target's
 
 _FORMS = {"pose": structs.POSE, "rotation vectors": structs.ROTATION_VECTORS}  # others are rays
@@ -40,11 +40,12 @@ _SAMPLES_PER_THREAD = 4  # with as many, threads that idle at the end matter lit
 _FLAGS_OF_PIXELS = 1 << structs.LEFT_BITS  # flags of pixels stand above those of the lattice
 
 
-def natives_of(warp: CameraPair) -> tuple[Native, Native, Tensor | None] | None:
+def natives_of(warp: RoutedWarp) -> tuple[Native, Native, Tensor | None] | None:
     """Return source, target and rotation of a warp for native code; None if it has to go step by step."""
-    source, target, rotation = ends = warp.ends
-    if not warp.moves_by_cameras or warp.is_pinned or ends.goes_round:
+    pair = warp.pair
+    if not warp.moves_by_cameras or warp.is_pinned or pair.goes_round:
         return None
+    source, target, rotation = pair
     made = native_forms((source, target), target.intrinsics, *(() if rotation is None else (rotation,)))
     return None if made is None else (*made[0], rotation)  # type: ignore[return-value]
 
@@ -171,19 +172,21 @@ class SampleCall:
         """Take the arguments of `call_for`."""
         self._sizes, self._dtype, self._batched = sizes, dtype, batched
         self._count = count = len(values[0]) if batched else 1
+        # which values are images, pixels and boxes, and rays and the like; C has an array for each
+        images = [i for i, how in enumerate(hows) if isinstance(how, Sampler)]
+        moved = [i for i, how in enumerate(hows) if how in ("pixels", "boxes")]
+        turned = [i for i in range(len(hows)) if i not in images and i not in moved]
+        self._jobs = (structs.Job * len(images))()
+        moves = (structs.Move * len(moved))()
+        turns = (structs.Turned * len(turned))()
+        call = self._call = structs.Together(job_count=len(images), move_count=len(moved), turned_count=len(turned))
+        call.jobs, call.moves, call.turned = call.keep(self._jobs), call.keep(moves), call.keep(turns)
         # the lattice by which all images are sampled
-        samplers = [how for how in hows if isinstance(how, Sampler)]
+        samplers: list[Any] = [hows[i] for i in images]
         padding = serving_all("zeros", *(how.padding_mode for how in samplers))
         with torch.inference_mode(False):
             nodes, tolerance = probes(0, sizes[1], dtype), float(options["tolerance"] or 0)
             self._lattices = Lattices(nodes, sizes[1], sizes[0], tolerance, padding, count)
-        # arrays of C: a job for each image, a move for pixels and boxes, and a turn for rays and the like
-        images, moving = len(samplers), sum(how in ("pixels", "boxes") for how in hows)
-        self._jobs = (structs.Job * images)()
-        moves = (structs.Move * moving)()
-        turns = (structs.Turned * (len(hows) - images - moving))()
-        call = self._call = structs.Together(job_count=images, move_count=moving, turned_count=len(turns))
-        call.jobs, call.moves, call.turned = call.keep(self._jobs), call.keep(moves), call.keep(turns)
         call.lattices = self._lattices.struct
         self._back = call.lattices.move  # from the target to the source, which images are sampled by
         if count > 1:  # C samples images as soon as their lattice is made
@@ -191,24 +194,20 @@ class SampleCall:
         else:
             self._back.next = None  # one thread makes the lattice, and needs no counter of those made
         self._most_tiles = 1  # of the images, each of which threads share
-        self._readers: list[Reader] = []  # of each value
-        self._copied: list[int] = []  # which values C reads from copies
+        readers: dict[int, Reader] = {}
+        for i, job, how in zip(images, self._jobs, samplers, strict=True):
+            readers[i] = self._reader_of_images(job, values[i], how)
+        for i, move in zip(moved, moves, strict=True):
+            readers[i] = self._reader_of_pixels(move, values[i], 2 if hows[i] == "pixels" else 4)
+        for i, turn in zip(turned, turns, strict=True):
+            readers[i] = self._reader_of_vectors(turn, values[i], hows[i])
+        self._readers = [readers[i] for i in range(len(hows))]
+        self._copied = [i for i in moved if values[i].dtype != dtype or not values[i].is_contiguous()]
+        self._may_be_refused = [i for i, how in enumerate(hows) if how in ("boxes", "pose", "rotation vectors")]
         # whether each run asks if images shrink: these are halved elsewhere
         self._may_halve = options["antialias"] is None and any(map(_is_averaged, values, hows))
-        free_jobs, free_moves, free_turns = iter(self._jobs), iter(moves), iter(turns)
-        for i, (value, how) in enumerate(zip(values, hows, strict=True)):
-            if isinstance(how, Sampler):
-                reader = self._reader_of_images(next(free_jobs), value, how)
-            elif how in ("pixels", "boxes"):
-                reader = self._reader_of_pixels(next(free_moves), value, 2 if how == "pixels" else 4)
-                if value.dtype != dtype or not value.is_contiguous():
-                    self._copied.append(i)
-            else:
-                reader = self._reader_of_vectors(next(free_turns), value, how)
-            self._readers.append(reader)
-        self._images_of_call = images if count == 1 else 0  # those of a batch are made with their lattices
+        self._images_of_call = len(images) if count == 1 else 0  # those of a batch are made with their lattices
         self._is_small = self._most_tiles <= _TILES_FOR_ONE_THREAD or not self._images_of_call  # one thread makes all
-        self._may_be_refused = [i for i, how in enumerate(hows) if how in ("boxes", "pose", "rotation vectors")]
 
     def _reader_of_images(self, job: structs.Job, like: Tensor, how: Sampler) -> Reader:
         """Write into a job of C what all runs share; return what writes the rest in each run."""
@@ -221,7 +220,7 @@ class SampleCall:
         self._most_tiles = max(self._most_tiles, tiles_of(result[:1]))
         make = _image_maker(like, self._batched, make_images)
 
-        def read(value: Tensor, step: int) -> MovedField:
+        def read(value: Tensor) -> MovedField:
             result = make()
             job.source, job.result = value.data_ptr(), result.data_ptr()
             return result, None
@@ -230,32 +229,34 @@ class SampleCall:
 
     def _reader_of_pixels(self, move: structs.Move, like: Tensor, each: int) -> Reader:
         dtype, back = self._dtype, self._back
+        turn_strides: Any = back.turn_strides
         many = like.numel() // (each * self._count) if self._count else 0
         move.turn_strides[:] = 0, 3, 1
-        move.cameras, (move.height, move.width) = self._count, self._sizes[1]
+        move.cameras = self._count
+        move.height, move.width = self._sizes[1]
         move.form = structs.ON_IMAGE if each == 2 else structs.BOXES
         move.count, move.tile = many, max(many, 1)
         move.row_strides[:] = move.result_strides[:] = each * many, each, 1
 
-        def read(rows: Tensor, step: int) -> MovedField:
+        def read(rows: Tensor) -> MovedField:
             result = torch.empty(rows.shape, dtype=dtype, device="cpu")
             valid = torch.empty(rows.shape[:-1], dtype=torch.bool, device="cpu")
             # the other way round than `back`, whose strides 1, 3 transpose the rotations
             move.from_, move.to, move.turns = back.to, back.from_, back.turns
-            move.turn_strides[0] = step
+            move.turn_strides[0] = turn_strides[0]
             move.rows, move.results, move.valid = rows.data_ptr(), result.data_ptr(), valid.data_ptr()
             return result, valid
 
         return read
 
-    def _reader_of_vectors(self, turned: structs.Turned, like: Tensor, how: Label) -> Reader:
+    def _reader_of_vectors(self, turned: structs.Turned, like: Tensor, how: Any) -> Reader:
         back, width = self._back, like.shape[-1]
         is_matrix = how in ("columns", "pose")
         turned.strides[:], turned.count = ((1, width), width) if is_matrix else ((3, 1), like.numel() // 3)
         turned.is_double = self._dtype == torch.float64
         turned.form = _FORMS.get(how, structs.RAYS)
 
-        def read(value: Tensor, step: int) -> MovedField:
+        def read(value: Tensor) -> MovedField:
             result = value.clone()
             turned.turn, turned.rows, turned.results = back.turns, value.data_ptr(), result.data_ptr()
             return result, None
@@ -289,7 +290,7 @@ class SampleCall:
         back.turns, back.turn_strides[0] = turn, step
         if self._copied:
             values = [value.to(dtype).contiguous() if i in self._copied else value for i, value in enumerate(values)]
-        results: list[MovedField | None] = [read(one, step) for read, one in zip(self._readers, values, strict=True)]
+        results: list[MovedField | None] = [read(value) for read, value in zip(self._readers, values, strict=True)]
         native, threads = loaded(), thread_count()
         # images of a batch, by the threads that make the lattices
         if self._count > 1 and len(self._jobs):
@@ -315,7 +316,7 @@ class SampleCall:
     def _follow(self, flags: int, source: Native, target: Native) -> int:
         """Compute limits that the call lacked: of cameras for the lattice, or for pixels, whose flags it returns."""
         of_pixels = flags // _FLAGS_OF_PIXELS
-        left, (start, end) = (of_pixels, (source, target)) if of_pixels else (flags, (target, source))
+        left, start, end = (of_pixels, source, target) if of_pixels else (flags, target, source)
         if left & structs.LEFT_FROM:
             start.follow()
         if left & structs.LEFT_TO:

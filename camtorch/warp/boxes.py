@@ -9,13 +9,13 @@ from camtorch.evaluate.devices import sent
 from camtorch.evaluate.tensors import is_predicted, known_true
 from camtorch.native.structs import EDGE_POINTS
 from camtorch.values.arguments import Numbers, as_coordinates, as_values, as_whole, check_boxes
-from camtorch.warp.camera_pair import CameraPair
+from camtorch.warp.routes import RoutedWarp
 
 _ROUNDED_PIXELS = 1e-3  # from a panorama's edges, where rounding would cost rays
 _LATTICE_STEPS = 16  # across and down the target, between points that are tested against a polygon
 
 
-def moved_boxes(warp: CameraPair, boxes: Numbers) -> tuple[Tensor, Tensor]:
+def moved_boxes(warp: RoutedWarp, boxes: Numbers) -> tuple[Tensor, Tensor]:
     """Return boxes moved by a warp, and whether they are valid; see `Warp.transform_boxes`."""
     boxes = as_values(boxes, "boxes", "Warp", warp.source.intrinsics.device)
     if boxes.ndim == 0 or boxes.shape[-1] != 4:
@@ -29,7 +29,7 @@ def moved_boxes(warp: CameraPair, boxes: Numbers) -> tuple[Tensor, Tensor]:
     return torch.where(ordered.unsqueeze(-1), enclosing, -1.0), valid & ordered
 
 
-def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
+def enclosed(warp: RoutedWarp, corners: Tensor) -> tuple[Tensor, Tensor]:
     """Return the boxes that enclose moved polygons, and whether they are valid; see `Warp.enclose`."""
     corners = as_coordinates(corners, "corners", 2, "Warp", warp.source.intrinsics.device, "B, *N, K")
     if corners.ndim < 2:
@@ -37,7 +37,7 @@ def enclosed(warp: CameraPair, corners: Tensor) -> tuple[Tensor, Tensor]:
     return around(warp, corners, *warp.move(along_edges(corners, EDGE_POINTS)))
 
 
-def around(warp: CameraPair, corners: Tensor, moved: Tensor, mapped: Tensor) -> tuple[Tensor, Tensor]:
+def around(warp: RoutedWarp, corners: Tensor, moved: Tensor, mapped: Tensor) -> tuple[Tensor, Tensor]:
     """Return the boxes that enclose polygons, of which a warp has moved the points along their edges."""
     finite = torch.isfinite(corners).flatten(-2).all(-1, keepdim=True)
     mapped = mapped & finite
@@ -57,7 +57,7 @@ def around(warp: CameraPair, corners: Tensor, moved: Tensor, mapped: Tensor) -> 
     return torch.where(some.unsqueeze(-1), torch.cat((low, high), -1), -1.0), valid
 
 
-def _inside(warp: CameraPair, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+def _inside(warp: RoutedWarp, corners: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
     """Return a lattice (N, 2) over the target, and whether (B, *M, N) polygons enclose the scene at its points."""
     height, width = warp.target.size_for("Warp")
     host, device = warp.host, like.device

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache, reduce
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -28,7 +27,7 @@ from camtorch.native.structs import (
     CELL_TODO,
     STEP,
 )
-from camtorch.warp.lattice import Lattice, probes
+from camtorch.warp.lattice import Lattice, lagrange, probes
 
 Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Pixels (h, w, 2) for every camera, or (B, h, w, 2) for each its own, to positions (B or 1, h, w, 2) as of
@@ -264,18 +263,10 @@ def lay_quintics(nodes: Tensor, cells: Tensor, count: int) -> Tensor:
     if not len(place):
         return nodes.new_empty(2, 0, STEP, STEP)
     cells[some] = torch.arange(count, count + len(place), dtype=cells.dtype, device=cells.device)
-    weights = _quintics()
+    weights = lagrange(6, nodes.device)
     # torch may be told to multiply matrices of less than float64 in fewer bits
     around = _around(nodes, camera, place).double()
     return (weights @ around @ weights.mT).to(nodes.dtype).transpose(0, 1)
-
-
-@lru_cache(maxsize=1)
-def _quintics() -> Tensor:
-    """Return Lagrange's weights (8, 6) of six nodes, on the way from the third to the fourth one; on the CPU."""
-    with torch.inference_mode(False):
-        t = torch.arange(STEP, dtype=torch.float64, device="cpu")[:, None] / STEP + 2
-        return torch.cat([reduce(torch.mul, [(t - k) / (j - k) for k in range(6) if k != j]) for j in range(6)], -1)
 
 
 def _around(nodes: Tensor, camera: Tensor, place: Tensor) -> Tensor:

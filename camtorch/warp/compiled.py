@@ -20,7 +20,7 @@ from camtorch.cameras.operators import CameraNumbers, opaque
 from camtorch.evaluate.kept import Kept
 from camtorch.native.sampler import layout
 from camtorch.values.arguments import broadcast_shapes
-from camtorch.warp.grid import Between, locate
+from camtorch.warp.grid import CameraPair, locate
 from camtorch.warp.options import Sampler
 from camtorch.warp.sampling import render
 
@@ -46,13 +46,13 @@ def positions(
 ) -> tuple[Tensor, Tensor]:
     """Return the positions of all target pixels, planes (B or 1, 2, H', W'), and whether they are mapped."""
     every = range(target.size_for("Warp")[0])
-    grid, mapped = locate(Between(source, target, rotation), every, tolerance, padding, False).pixels[:2]
+    grid, mapped = locate(CameraPair(source, target, rotation), every, tolerance, padding, False).pixels[:2]
     return grid.movedim(-1, 1).contiguous(), mapped.contiguous()
 
 
 def warped(
     images: Tensor,
-    cameras: Between,
+    cameras: CameraPair,
     tolerance: float,
     antialias: bool | None,
     padding: str,
@@ -104,7 +104,7 @@ def _warp(
     """Return images (B, C, h, w); see `warped`."""
     *texts, is_last = options
     antialias, padding, how = read(*texts)
-    cameras, every = Between(source, target, rotation), range(target.size_for("Warp")[0])
+    cameras, every = CameraPair(source, target, rotation), range(target.size_for("Warp")[0])
     found = partial(locate, cameras, every, tolerance, padding, bool(antialias))
     form = source.form, target.form, tolerance, antialias, padding, rotation is None
     where = _located(cameras.tensors, form, found)

@@ -31,7 +31,7 @@ from camtorch.warp.panorama import goes_round, lengths, off_poles, seam_of, with
 _STRIP_PIXELS = 1 << 19
 
 
-class Between(NamedTuple):
+class CameraPair(NamedTuple):
     """Two cameras at one place: `ray_target = R ray_source`."""
 
     source: Camera
@@ -45,9 +45,9 @@ class Between(NamedTuple):
         return found if self.rotation is None else [*found, self.rotation]
 
     @property
-    def back(self) -> Between:
+    def back(self) -> CameraPair:
         """The way from target to source."""
-        return Between(self.target, self.source, None if self.rotation is None else self.rotation.mT)
+        return CameraPair(self.target, self.source, None if self.rotation is None else self.rotation.mT)
 
     @property
     def goes_round(self) -> bool:
@@ -105,7 +105,7 @@ def placed(camera: Camera, pixels: Tensor, valid: Tensor, on_image: bool) -> tup
 
 
 @on_one_thread
-def locate(cameras: Between, rows: range, tolerance: float, padding: str, antialias: bool) -> Positions:
+def locate(cameras: CameraPair, rows: range, tolerance: float, padding: str, antialias: bool) -> Positions:
     """Return where rows of a target sample the source's image: a lattice if that serves, else all positions.
 
     Antialiased images need all, of a lattice or not.
@@ -118,7 +118,7 @@ def locate(cameras: Between, rows: range, tolerance: float, padding: str, antial
     return _located(cameras, rows, tolerance, padding)
 
 
-def _located(cameras: Between, rows: range, tolerance: float, padding: str) -> Positions:
+def _located(cameras: CameraPair, rows: range, tolerance: float, padding: str) -> Positions:
     lattice = on_lattice(cameras, rows, tolerance, padding) if tolerance else None
     return lattice or PixelPositions(*_row_by_row(cameras, rows), None)
 
@@ -133,7 +133,7 @@ def scaled_rows(
     return where if around == rows else where.part(slice(rows.start - around.start, rows.stop - around.start))
 
 
-def _row_by_row(cameras: Between, rows: range) -> tuple[Tensor, Tensor]:
+def _row_by_row(cameras: CameraPair, rows: range) -> tuple[Tensor, Tensor]:
     """Return the exact sampling positions of rows of a target, and which are mapped, see `Exact`."""
     target = cameras.target
     if is_unknown(target.intrinsics):
@@ -191,7 +191,7 @@ def local_scale(grid: Tensor, mapped: Tensor, source: Camera) -> Tensor:
     return scale
 
 
-def on_lattice(cameras: Between, rows: range, tolerance: float, padding: str) -> Lattice | None:
+def on_lattice(cameras: CameraPair, rows: range, tolerance: float, padding: str) -> Lattice | None:
     """Return a lattice with positions of a target's rows within `tolerance` pixels of the exact ones.
 
     1. Cubics between its nodes, every eighth pixel, serve at first.
@@ -212,7 +212,7 @@ def on_lattice(cameras: Between, rows: range, tolerance: float, padding: str) ->
     return find(cameras, rows.start, size, tolerance, padding)
 
 
-def _learning(cameras: Between, first: int, size: tuple[int, int], tolerance: float, padding: str) -> Lattice | None:
+def _learning(cameras: CameraPair, first: int, size: tuple[int, int], tolerance: float, padding: str) -> Lattice | None:
     """Return a lattice that is found without a graph, and of which nodes and exact cells are computed again with one.
 
     Cells that quintics do are `CELL_QUINTIC`, and more than a fifth exact ones are too many. None if derivatives may
@@ -256,7 +256,7 @@ def _has_parts(model: type[Camera], count: int) -> bool:
 
 
 def _found(
-    cameras: Between, first: int, size: tuple[int, int], tolerance: float, padding: str, learns: bool = False
+    cameras: CameraPair, first: int, size: tuple[int, int], tolerance: float, padding: str, learns: bool = False
 ) -> Lattice | None:
     """Return the lattice of `on_lattice` without a graph; if it `learns`, the one that `_learning` begins with."""
     native = cameras.native_positions()

@@ -276,11 +276,20 @@ def interpolated(nodes: Tensor, rows: int, columns: int) -> Tensor:
     return result.to(nodes.dtype).view(len(nodes), 2, rows * STEP, columns * STEP)
 
 
+def lagrange(taps: int, device: torch.device) -> Tensor:
+    """Return Lagrange's weights (8, taps) in float64 of nodes at the pixels of a cell, between the middle two nodes."""
+    t = torch.arange(STEP, dtype=torch.float64, device=device) / STEP
+    nodes = range(1 - taps // 2, taps // 2 + 1)
+    weights = []
+    for node in nodes:
+        factors = [(t - other) / (node - other) for other in nodes if other != node]
+        weights.append(reduce(torch.mul, factors))
+    return torch.stack(weights, -1)
+
+
 def _weights(taps: int, dtype: torch.dtype, wide: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return weights (8, taps) of nodes at the pixels of a cell, and the matrix that has these for a block of cells."""
-    t, at = torch.arange(STEP, dtype=torch.float64, device=device) / STEP, range(1 - taps // 2, taps // 2 + 1)
-    parts = [math.prod(((t - m) / (k - m) for m in at if m != k), start=torch.ones_like(t)) for k in at]
-    weights, cells = torch.stack(parts, -1).to(dtype), _BLOCK_PIXELS // STEP
+    weights, cells = lagrange(taps, device).to(dtype), _BLOCK_PIXELS // STEP
     spread = weights.new_zeros(cells + taps - 1, cells, STEP, dtype=wide)
     for cell in range(cells):
         spread[cell : cell + taps, cell] = weights.T

@@ -25,7 +25,7 @@ from camtorch.values.arguments import (
 )
 from camtorch.values.module import GeometryModule
 from camtorch.warp.affine import UncheckedWarp
-from camtorch.warp.grid import Between
+from camtorch.warp.grid import CameraPair
 from camtorch.warp.options import TolerantOptions
 from camtorch.warp.warp import Warp
 
@@ -203,9 +203,9 @@ class ShutterWarp(UncheckedWarp):
         self.turned_by(rotation)
 
     @property
-    def ends(self) -> Between:
+    def pair(self) -> CameraPair:
         source, target = _in_motion(self.source, self.shutter), _in_motion(self.target, self.target_shutter)
-        return Between(source, target, self.rotation)
+        return CameraPair(source, target, self.rotation)
 
     def inverse(self) -> Warp:
         """Return the warp from target to source. It applies the shutter that this one undoes, and undoes the other."""

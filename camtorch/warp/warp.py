@@ -30,8 +30,8 @@ from camtorch.values.dtypes import check_averaged
 from camtorch.values.module import typed_as
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
-from camtorch.warp.camera_pair import CameraPair, KeptPositions
 from camtorch.warp.options import MODES, PADDINGS, Fill, Mode, Options, PaddingMode, Sampler, as_fill, as_options
+from camtorch.warp.routes import KeptPositions, RoutedWarp
 
 
 def as_sized(camera: Camera, name: str, owner: str) -> Camera:
@@ -44,7 +44,7 @@ def as_sized(camera: Camera, name: str, owner: str) -> Camera:
     return camera
 
 
-class Warp(CameraPair):
+class Warp(RoutedWarp):
     """A layer that turns images of camera `source` into images of camera `target`, both at one place.
 
     Convention: `ray_target = R ray_source` (OpenCV's rectification R). Images are tensors (..., C, H, W), NumPy arrays
@@ -85,11 +85,6 @@ class Warp(CameraPair):
         TypeError: If source or target is no Camera.
     """
 
-    batch_shape: torch.Size
-    mode: Mode
-    padding_mode: PaddingMode
-    fill: tuple[float, ...]
-    antialias: bool | None
     _has_shutters: ClassVar[bool] = False
 
     def __init__(

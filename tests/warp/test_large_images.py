@@ -5,7 +5,7 @@ import torch
 from cameras import fisheye, turn
 
 import camtorch as ct
-from camtorch.warp import camera_pair, sampling
+from camtorch.warp import routes, sampling
 from camtorch.warp.options import MODES, PADDINGS
 
 SIZE = (90, 120)
@@ -67,8 +67,8 @@ def test_long_grids_are_neither_made_at_once_nor_kept(monkeypatch):
     one = ct.Warp(*pair(), fill=2.0)
     given = images(torch.uint8)
     expected, mask = one(given), one.valid_mask()
-    monkeypatch.setattr(camera_pair, "_MOST_KEPT_PIXELS", 1000)
-    monkeypatch.setattr(camera_pair, "_STRIP_PIXELS", 1000)
+    monkeypatch.setattr(routes, "_MOST_KEPT_PIXELS", 1000)
+    monkeypatch.setattr(routes, "_STRIP_PIXELS", 1000)
     long = ct.Warp(*pair(), fill=2.0)
     assert torch.equal(long(given), expected)
     assert torch.equal(long.valid_mask(), mask)

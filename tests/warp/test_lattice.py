@@ -28,7 +28,7 @@ def way(request, monkeypatch):
         pytest.skip("there is no compiled library")
     if request.param == "torch":
         monkeypatch.setattr(cells, "native_available", lambda: False)
-        monkeypatch.setattr(grid.Between, "native_positions", lambda _: None)
+        monkeypatch.setattr(grid.CameraPair, "native_positions", lambda _: None)
 
 
 def check(source, target, rotation):
@@ -90,11 +90,11 @@ def test_torch_doubts_the_cells_that_compiled_code_doubts(key, monkeypatch):
 
     for pair in ((camera, target), (target, camera), (camera, camera)):
         for padding, tolerance in (("zeros", 1e-3), ("border", 1e-3), ("reflection", 0.1)):
-            given = grid.Between(*pair, rotation), range(240), tolerance, padding
+            given = grid.CameraPair(*pair, rotation), range(240), tolerance, padding
             compiled = grid.on_lattice(*given)
             with monkeypatch.context() as patch:
                 patch.setattr(cells, "native_available", lambda: False)
-                patch.setattr(grid.Between, "native_positions", lambda _: None)
+                patch.setattr(grid.CameraPair, "native_positions", lambda _: None)
                 patch.setattr(cells, "classify", both)
                 patch.setattr(cells, "are_smooth", lambda *_: False)
                 laid = grid.on_lattice(*given)

@@ -174,7 +174,7 @@ def test_a_grid_kept_from_inference_mode_serves_training():
 @pytest.mark.slow
 def test_export_takes_any_number_of_cameras_that_are_inputs(monkeypatch):
     # as if images were so large that little is kept: a comparison with that would bound the batch
-    for name in ("warp.camera_pair._MOST_KEPT_PIXELS", "rays.fields._MOST_KEPT_RAYS"):
+    for name in ("warp.routes._MOST_KEPT_PIXELS", "rays.fields._MOST_KEPT_RAYS"):
         monkeypatch.setattr(f"camtorch.{name}", 10 * math.prod(SIZE))
 
     class Seen(torch.nn.Module):

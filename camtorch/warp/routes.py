@@ -1,10 +1,10 @@
-"""Two cameras at one place, and the way that images and points go from one to the other.
+"""What every warp holds, and how it finds the positions at which its images are sampled.
 
 Which way a warp goes is decided in four places, after `ready` has asked for a kept call, and an `UncheckedWarp` whether
 images are copied, resized or halved:
 
-1. `CameraPair.route`: kept positions, those of a graph, strips, or an operator of a compiled graph.
-2. `CameraPair.computed`: positions to keep are found by the same warp on the CPU, by an operator, or by `locate`.
+1. `RoutedWarp.route`: kept positions, those of a graph, strips, or an operator of a compiled graph.
+2. `RoutedWarp.computed`: positions to keep are found by the same warp on the CPU, by an operator, or by `locate`.
 3. `locate` in `grid.py`: a lattice, or exact positions.
 4. `prepared` in `sampling.py`: native code, or torch.
 """
@@ -41,7 +41,7 @@ from camtorch.native.sampler import Call, maker
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
 from camtorch.warp import compiled
-from camtorch.warp.grid import Between, local_scale, locate
+from camtorch.warp.grid import CameraPair, local_scale, locate
 from camtorch.warp.lattice import PixelPositions, Positions
 from camtorch.warp.options import Mode, Options, PaddingMode, Sampler, serving_all
 from camtorch.warp.panorama import Seam, seam_of
@@ -91,24 +91,24 @@ class KeptPositions:
             self.calls[form] = call
 
 
-class CameraPair(GeometryModule):
-    """The state of a `Warp`: source, target, rotation and options; and where target pixels lie."""
+class RoutedWarp(GeometryModule):
+    """The state of a `Warp`: source, target, rotation and options; and the routes to the positions of its pixels."""
 
     moves_by_cameras: ClassVar[bool] = True  # and a rotation: native code and operators need no more
     joins_earlier: ClassVar[bool] = False  # True: after another warp both are one, `between` the cameras of that
     keeps_depth: ClassVar[bool] = False  # True: depths along the axis stay, as the camera does
     may_mirror: ClassVar[bool] = False  # True: the rotation may be a mirror
-    batch_shape: torch.Size
-    padding_mode: PaddingMode
-    _tolerance: float | None
-    mode: Mode
-    fill: tuple[float, ...]
-    _kept: Kept
-    _host: Kept | None = None
     source: Camera = _part("_modules", "source")
     target: Camera = _part("_modules", "target")
     rotation: Tensor | None = _part("_buffers", "rotation")
+    batch_shape: torch.Size
+    mode: Mode
+    padding_mode: PaddingMode
+    fill: tuple[float, ...]
     antialias: bool | None
+    _tolerance: float | None
+    _kept: Kept
+    _host: Kept | None = None
 
     def set_up(self, source: Camera, target: Camera, options: Options, batch: torch.Size | None = None) -> None:
         """Give a new warp its cameras and options, which are valid."""
@@ -128,7 +128,7 @@ class CameraPair(GeometryModule):
 
     def __dir__(self) -> list[str]:
         """Return the names that users call, without those by which packages and other kinds of warps ask this one."""
-        inside = {*vars(CameraPair), *dir(GeometryModule)}
+        inside = {*vars(RoutedWarp), *dir(GeometryModule)}
         inside |= {"rows_of", "own_parts", "transform_positions", "moved_distance"}
         inside -= {"source", "target", "rotation", "tolerance", *dir(nn.Module)}
         names: list[str] = super().__dir__()  # type: ignore[no-untyped-call]
@@ -168,7 +168,7 @@ class CameraPair(GeometryModule):
         entry = host.entry(self.tensors, ())
         return None if entry is None else entry.result
 
-    def follow_host(self, host: CameraPair) -> Self:
+    def follow_host(self, host: RoutedWarp) -> Self:
         """Have a warp like this one, on the CPU, find the positions while the cameras stay; return this warp."""
         if not self.target.intrinsics.is_cpu:
             self._host = Kept()
@@ -186,40 +186,40 @@ class CameraPair(GeometryModule):
     @property
     def tensors(self) -> list[Tensor]:
         """All tensors that positions depend on."""
-        source, target, rotation = self.ends
+        source, target, rotation = self.pair
         return [*source.tensors, *target.tensors, *(() if rotation is None else (rotation,))]
 
     @property
     def form(self) -> tuple[object, ...]:
         """All that positions depend on in addition to `tensors`."""
-        source, target, rotation = self.ends
+        source, target, rotation = self.pair
         return source.form, target.form, rotation is None, self.antialias, self._tolerance
 
     @property
-    def ends(self) -> Between:
+    def pair(self) -> CameraPair:
         """Source, target and rotation by which pixels move: cameras that have shutters are behind them."""
         parts: Any = self._modules
-        return Between(parts["source"], parts["target"], self.rotation)
+        return CameraPair(parts["source"], parts["target"], self.rotation)
 
     @property
     def seam(self) -> Seam | None:
         """The `Seam` that lengthens the source's images before they are sampled; None if they stay."""
-        return seam_of(self.ends.source)
+        return seam_of(self.pair.source)
 
     @property
-    def sampled(self) -> Between:
-        """The `ends` by which positions are found: the source is the camera of the images that `seam` lengthens."""
-        ends, seam = self.ends, self.seam
-        return ends if seam is None else ends._replace(source=seam.camera_of(ends.source))
+    def sampled(self) -> CameraPair:
+        """The `pair` whose source is the camera of the images that are sampled, which `seam` may have lengthened."""
+        pair, seam = self.pair, self.seam
+        return pair if seam is None else pair._replace(source=seam.camera_of(pair.source))
 
     def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Positions:
         """Return positions of some rows of the target, which serve a padding, within a tolerance."""
         return locate(self.sampled, rows, tolerance, padding, bool(self.antialias))
 
     def move(self, pixels: Numbers, back: bool = False, on_image: bool = False) -> tuple[Tensor, Tensor]:
-        """Return pixels of the source on the target's image, or back, and whether there is one; see `Between.move`."""
-        ends = self.ends
-        return (ends.back if back else ends).move(pixels, on_image)
+        """Return pixels of the source on the target's image, or back, and their validity; see `CameraPair.move`."""
+        pair = self.pair
+        return (pair.back if back else pair).move(pixels, on_image)
 
     def route(self, images: Tensor | None = None) -> Route:
         """Return the route of images, or of positions alone; `locate` and `render` choose the lattice and the sampler.
@@ -328,7 +328,7 @@ class CameraPair(GeometryModule):
         return self.positions(self.route()).pixels
 
     def computed(self, padding: PaddingMode, tolerance: float) -> Positions:
-        """Return the positions of all pixels, without a graph, which serve a padding."""
+        """Return the positions of all pixels, without a graph, which serve a padding within a tolerance."""
         if tolerance:
             host = None if self.antialias else self.host
             if host is not None:
