@@ -186,12 +186,15 @@ def kept_cameras(memo: Kept, model: type[CameraLike], intrinsics: Tensor, distor
     """Return the cameras (C,) of one model, kept in a memo until a value changes."""
     cameras: CameraRows | None = memo.result
     if cameras is not None:
-        for now, noted in zip((intrinsics, distortion), cameras.notes, strict=True):
-            then, mark = noted
-            # a single camera comes as (n,) from warps, as (1, n) from `per_row`; marks do not tell them apart
-            if mark is None and now.ndim != then.ndim and now.numel() == then.numel():
-                now = now[None] if now.ndim < then.ndim else now[0]
-            if not same(now, noted):
+        for now, (then, mark) in zip((intrinsics, distortion), cameras.notes, strict=True):
+            if mark is not None:
+                is_same = same(now, (then, mark))
+            else:
+                # a single camera comes as (n,) from warps, as (1, n) from `per_row`
+                if now.ndim != then.ndim and now.numel() == then.numel():
+                    now = now[None] if now.ndim < then.ndim else now[0]
+                is_same = now.dtype == then.dtype and now.device == then.device and torch.equal(now, then)
+            if not is_same:
                 break
         else:
             return cameras
