@@ -93,7 +93,6 @@ def test_batches_as_step_by_step(key, name, threads):
     """Each sample of a batch goes to a thread: the numbers do not depend on that."""
     camera, before = example(key, SIZE).requires_grad_(False), torch.get_num_threads()
     sample = {field: torch.stack([value, value.flip(-1)] * 2) for field, value in sample_for(torch.float32).items()}
-    torch.manual_seed(0)
     augment = AUGMENTATIONS[name]()
     torch.set_num_threads(threads)
     try:
@@ -123,7 +122,6 @@ def test_a_sample_of_a_batch_is_what_it_is_alone(name, dtype):
     augment = A.Compose([A.RandomResizedCrop(SIZE), A.HorizontalFlip(landmarks={}), LAST[name]()])
     camera, alone = example("brown_conrady", SIZE).to(dtype).requires_grad_(False), sample_for(dtype)
     alone |= {"boxes": torch.tensor([[20, 20, 60, 50]], dtype=dtype), "gaze": torch.tensor([0.6, 0, -0.8], dtype=dtype)}
-    torch.manual_seed(0)
     draw = augment.draw(4)
     batch = augment({field: torch.stack([value] * 4) for field, value in alone.items()}, camera=camera, draw=draw)
     cameras = batch.pop("camera")
@@ -158,7 +156,6 @@ ANGLES = 0, 1e-30, 1e-8, 1e-3, 0.09, 0.11, 1, 2, math.pi - 1e-3, math.pi - 1e-7,
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_rotation_vectors_turn_by_the_formulas_of_torch(dtype, scale):
     augment = A.RandomMount(camera=example("pinhole", SIZE).to(dtype).requires_grad_(False))
-    torch.manual_seed(0)
     axes = torch.nn.functional.normalize(torch.randn(len(ANGLES), 8, 3, dtype=torch.float64), dim=-1)
     vectors = (axes * torch.tensor(ANGLES, dtype=torch.float64)[:, None, None]).flatten(0, 1).to(dtype)
     draws, singles, rotations = augment.draw(len(vectors)), [], []

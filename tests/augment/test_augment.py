@@ -226,7 +226,6 @@ def test_ranges_of_a_chain_are_those_of_its_parts():
 
 
 def test_chains_carry_validity_on():
-    torch.manual_seed(0)
     batch = {k: v for k, v in sample().items() if k != "depth"}
     half = RandomMount(yaw=25, valid_mask=True)(batch)
     out = RandomLens("kannala_brandt", fov=(70, 90), valid_mask=True)(half)

@@ -258,7 +258,7 @@ def test_what_would_not_move_or_be_misread_is_refused(vision):
 def test_plain_tensors_and_pil_images(vision):
     front_end, _ = vision
     transform, plain = front_end.Transform(augmentation(), camera()), torch.from_numpy(images()[0]).permute(2, 0, 1)
-    torch.manual_seed(3)
+    torch.manual_seed(3)  # as `expected` does
     moved, label = transform(plain, 5)
     torch.testing.assert_close(moved, expected(images()[0])["image"], rtol=0, atol=0)
     assert label == 5

@@ -85,7 +85,6 @@ def test_boxes_off_the_image_are_zeros_and_stay_that(key):
 def test_masks_keep_class_ids_and_lists_are_warped_one_by_one():
     aug = adapter.RandomCamera(camera(), mask_fill=255, tolerance=0.0)
     seq = K.AugmentationSequential(aug, data_keys=["input", "mask", "keypoints"])
-    torch.manual_seed(7)
     _, together, moved = seq(images(), masks(), points())
     assert together.dtype == torch.int64
     assert set(together.unique().tolist()) <= {*range(200), 255}
@@ -105,7 +104,6 @@ def test_same_on_batch_and_p_batch():
         warped = one(same)
         assert torch.equal(warped[0], warped[2])
         assert not torch.equal(warped[0], same[0])
-    torch.manual_seed(1)
     for p, gates in ((0.0, {(0.0,) * 3}), (0.5, {(0.0,) * 3, (1.0,) * 3})):
         aug, applied = adapter.RandomCamera(camera(), p_batch=p), set()
         for _ in range(8):
@@ -130,7 +128,6 @@ def test_keepdim_and_images_without_batch():
 @pytest.mark.parametrize("p", [1.0, 0.5])
 @pytest.mark.parametrize("cls", CLASSES)
 def test_replays_are_bit_identical(cls, p):
-    torch.manual_seed(9)
     flip = K.RandomHorizontalFlip(p=0.5)
     seq, fresh = (K.AugmentationSequential(cls(camera(), p=p), flip, data_keys=KEYS) for _ in range(2))
     data = batch()
@@ -153,7 +150,6 @@ def test_replays_are_bit_identical(cls, p):
 
 @pytest.mark.parametrize("cls", CLASSES)
 def test_inverse(cls):
-    torch.manual_seed(10)
     smooth = torch.nn.functional.interpolate(images(3, 1, (8, 10)), SIZE, mode="bicubic")
     blocks = (smooth > 0.5).long()
     seq = K.AugmentationSequential(cls(camera()), K.RandomHorizontalFlip(p=1.0), data_keys=KEYS)
@@ -220,7 +216,6 @@ def test_another_output_size_reaches_the_next_child():
 
 
 def test_nested_containers_and_random_apply():
-    torch.manual_seed(12)
     seq = K.AugmentationSequential(
         K.AugmentationSequential(adapter.RandomMount(camera()), K.RandomHorizontalFlip(p=1.0)),
         K.ImageSequential(adapter.RandomLens(camera(), p=0.5)),
@@ -240,7 +235,6 @@ def test_fields_of_dicts_that_kornia_does_not_know():
     given |= {"gaze": points(3, 3).mT / 99, "boxes": torch.rand(3, 1, 4).sort().values * 60, "path": "stays"}
     mount, lens = adapter.RandomMount(camera()), adapter.RandomLens(camera(), p=0.5)
     seq = K.AugmentationSequential(K.ImageSequential(mount), K.ColorJiggle(), lens, data_keys=None)
-    torch.manual_seed(2)
     moved = seq(given)
     assert torch.equal(moved["gaze"], lens.last.rays(mount.last.rays(given["gaze"])))
     assert (moved["path"], moved["boxes_valid"].shape) == ("stays", (3, 1))
@@ -291,7 +285,6 @@ def test_what_would_leave_fields_behind_is_refused(field):
 @pytest.mark.parametrize("same_on_frame", [False, True])
 @pytest.mark.parametrize("data_format", ["BTCHW", "BCTHW"])
 def test_videos(data_format, same_on_frame, same_on_batch):
-    torch.manual_seed(13)
     clips, frames = 2, 3
     aug = adapter.RandomCamera(camera(), same_on_batch=same_on_batch)
     video = K.VideoSequential(aug, data_format=data_format, same_on_frame=same_on_frame)

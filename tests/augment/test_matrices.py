@@ -127,7 +127,6 @@ def test_lists_clips_frames_and_half_precision():
 
 def test_gradients_reach_a_matrix():
     matrix = matrix_of(3, torch.float64).requires_grad_()
-    torch.manual_seed(0)
     augment = A.RandomMount(yaw=5)
     draw, pixels = augment.draw(2), projected(matrix_of(3, torch.float64), POINTS)
 

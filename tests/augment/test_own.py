@@ -41,7 +41,6 @@ class Upright(ct.augment.Augmentation):
 
 def test_the_example_zooms_all_that_a_sample_holds():
     nearer = Nearer(zoom=(2.0, 2.0), camera=camera(), valid_mask=True)
-    torch.manual_seed(0)
     points = torch.tensor([[[31.5, 23.5], [36.5, 23.5], [60.0, 40.0]]])
     out = nearer(image=torch.rand(1, 3, *SIZE), keypoints=points, gaze=torch.tensor([[0.0, 0.0, -1.0]]))
     torch.testing.assert_close(out["keypoints"][0, :2], torch.tensor([[31.5, 23.5], [41.5, 23.5]]), atol=1e-3, rtol=0)
