@@ -156,7 +156,7 @@ def test_all_fields_move_as_by_the_native_call(front_end, name, batch, monkeypat
 @pytest.mark.filterwarnings("ignore:.*will show nothing")
 @pytest.mark.parametrize("name", ["mount", "filled", "a box", *EDITS])
 @pytest.mark.parametrize("front_end", FRONT_ENDS)
-@pytest.mark.parametrize("key", ["K", "intrinsics", "camera_matrix", None])
+@pytest.mark.parametrize("key", ["K", "intrinsics", None])
 def test_a_matrix_or_a_number_stands_for_the_camera(front_end, key, name, monkeypatch):
     kornia = front_end == "kornia"
     if kornia and name == "a box":
