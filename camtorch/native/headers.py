@@ -37,27 +37,34 @@ class Shared(NamedTuple):
     """What Python and C share: fields with their type, or "*", and number, 0 if alone; results and types of calls."""
 
     structs: dict[str, dict[str, tuple[str, int]]]
-    values: dict[str, Any]
+    enumerations: list[dict[str, Any]]  # and numbers that are alone
     calls: dict[str, tuple[str, list[str]]]
+
+    @property
+    def values(self) -> dict[str, Any]:
+        return {name: value for one in self.enumerations for name, value in one.items()}
 
     @property
     def checksum(self) -> int:
         """The checksum of all names, types and values."""
-        return zlib.crc32(repr(self[:]).encode())
+        return zlib.crc32(repr((self.structs, self.values, self.calls)).encode())
 
 
 def read(folder: Path = _HERE) -> Shared:
     """Read `dispatch.c` and the headers that it includes."""
-    found, text = Shared({}, {}, {}), (folder / "dispatch.c").read_text("utf-8")
+    found, text = Shared({}, [], {}), (folder / "dispatch.c").read_text("utf-8")
     headers = _included(folder, text, set())
-    found.values.update((name, eval(numbers.replace("f", ""))) for name, numbers in _NUMBERS.findall(headers))
+    found.enumerations.extend({name: eval(numbers.replace("f", ""))} for name, numbers in _NUMBERS.findall(headers))
     for values, fields, name in _DECLARED.findall(headers):
         if name:
             found.structs[name] = dict(_fields(name, fields, found))
-        following = 0
+            continue
+        following, enumeration = 0, dict[str, int]()
         for word, _, value in (entry.partition("=") for entry in values.split(",") if entry.strip()):
-            found.values[word.strip()] = following = eval(value, {}, found.values) if value else following
+            following = eval(value, {}, found.values | enumeration) if value else following
+            enumeration[word.strip()] = following
             following += 1
+        found.enumerations.append(enumeration)
     for groups in _CALL.findall(text):
         result, name, given = groups[:3] if groups[0] else groups[3:]
         takes = ["".join(pair) for pair in re.findall(r"(\w+) (\*?)", given.replace("const ", ""))]
@@ -97,7 +104,12 @@ def layout_h(folder: Path = _HERE) -> str:
 def structs_py(folder: Path = _HERE) -> str:
     """Return the text of `structs.py`."""
     found = read(folder)
-    lines = [_HEAD, f"CHECKSUM = {found.checksum}", "", *(f"{name} = {value}" for name, value in found.values.items())]
+    lines = [_HEAD, f"CHECKSUM = {found.checksum}", ""]
+    for enumeration in found.enumerations:
+        values = list(enumeration.values())
+        counted = len(values) > 1 and values == list(range(len(values)))
+        right = f"range({len(values)})" if counted else ", ".join(map(str, values))
+        lines.append(f"{', '.join(enumeration)} = {right}")
     for struct, fields in found.structs.items():
         lines += ["", "", f"class {struct}(Struct):", "    __slots__ = ()"]
         for name, (kind, many) in fields.items():
