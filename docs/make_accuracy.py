@@ -1,7 +1,5 @@
 """Write docs/accuracy.md, how exact results are, from tests/golden and the models: python docs/make_accuracy.py."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator

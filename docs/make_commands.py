@@ -1,7 +1,5 @@
 """Write docs/commands.md, the page of all commands and options, from the parser: python docs/make_commands.py."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """One image for each augmentation: a sample with its labels before and after."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

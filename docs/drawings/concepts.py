@@ -1,7 +1,5 @@
 """The drawings of the pages on concepts and conventions."""
 
-from __future__ import annotations
-
 import math
 
 import torch

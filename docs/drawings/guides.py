@@ -1,7 +1,5 @@
 """The images of the guides."""
 
-from __future__ import annotations
-
 import functools
 import json
 import math

@@ -1,7 +1,5 @@
 """Marks on images, in one palette, drawn by Pillow."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """One image for each camera model: a room, a cube of lines and the radius over the angle, through a calibration."""
 
-from __future__ import annotations
-
 import math
 
 import matplotlib

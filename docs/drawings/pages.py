@@ -1,7 +1,5 @@
 """The galleries' pages, whose code makes their images."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

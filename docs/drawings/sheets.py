@@ -1,7 +1,5 @@
 """Images in rows, on paper."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from typing import Any

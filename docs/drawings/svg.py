@@ -1,7 +1,5 @@
 """Line drawings as SVG, on paper, so that they are read on light and dark pages alike."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from html import escape

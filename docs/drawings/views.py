@@ -1,7 +1,5 @@
 """Images of projections and of plots."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import shutil
