@@ -14,12 +14,20 @@ from typing_extensions import Unpack
 from camtorch.augment.cameras import known_camera
 from camtorch.augment.change import Change, Part, by_models, check_sizes, one_or_batch
 from camtorch.augment.devices import Elsewhere, twin_of
-from camtorch.augment.draws import checked_draw, chosen_boxes
-from camtorch.augment.empty_images import warn_if_empty, warn_of_unfilled
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
-from camtorch.augment.filling import enough, scaled
+from camtorch.augment.filling import enough, scaled, warn_if_empty, warn_of_unfilled
 from camtorch.augment.matrices import Guess
-from camtorch.augment.ranges import Draw, Range, as_tensors, draw_numbers, rows_of, values_for, which_apply
+from camtorch.augment.ranges import (
+    Draw,
+    Range,
+    as_tensors,
+    checked_draw,
+    chosen_boxes,
+    draw_numbers,
+    rows_of,
+    values_for,
+    which_apply,
+)
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed

@@ -103,7 +103,7 @@ class Compose(Augmentation):
     @property  # type: ignore[override]
     def ranges(self) -> Mapping[str, Range]:
         """The ranges of all parts, by the part's index and the name in it, as "0.yaw"; change those of a part."""
-        return _by_place({"apply": Range(0, 1), **part.ranges} for part in self.parts)
+        return _by_index({"apply": Range(0, 1), **part.ranges} for part in self.parts)
 
     @ranges.setter
     def ranges(self, value: Mapping[str, Range]) -> None:
@@ -113,7 +113,7 @@ class Compose(Augmentation):
     @property
     def crops(self) -> Mapping[str, int]:  # type: ignore[override]
         """The boxes that draws of all parts need; see `Augmentation`."""
-        return _by_place(part.crops for part in self.parts)
+        return _by_index(part.crops for part in self.parts)
 
     @property
     def mirroring(self) -> Mirroring | None:
@@ -188,7 +188,7 @@ class Compose(Augmentation):
         return ", ".join(f"{name}={value!r}" for name, value in options.items())
 
 
-def _by_place(parts: Iterable[Mapping[str, T]]) -> Mapping[str, T]:
+def _by_index(parts: Iterable[Mapping[str, T]]) -> Mapping[str, T]:
     """Return what parts have by name as one mapping, by the index of the part and the name, as "0.yaw"."""
     return MappingProxyType({f"{i}.{name}": value for i, part in enumerate(parts) for name, value in part.items()})
 

@@ -111,24 +111,24 @@ def _mirrored_head(change: Change, matrix: Tensor, options: Mapping[str, float])
     return torch.where(mirrored.to(matrix.device)[:, None, None] & lateral, -matrix, matrix)
 
 
-_PLACED = {"boxes_xywh": 0.0, "boxes_cxcywh": 0.5}  # boxes by place and sides: how far along them the place is
+_ANCHORS = {"boxes_xywh": 0.0, "boxes_cxcywh": 0.5}  # boxes by a point and sides: how far along these the point is
 
 
 def as_corners(kind: str, boxes: Tensor) -> Tensor:
     """Return boxes (..., 4) of a kind as x1, y1, x2, y2."""
-    if kind not in _PLACED:
+    if kind not in _ANCHORS:
         return boxes
-    place, size = widen(boxes).split(2, -1)
-    low = place - _PLACED[kind] * size
+    anchor, size = widen(boxes).split(2, -1)
+    low = anchor - _ANCHORS[kind] * size
     return torch.cat((low, low + size), -1)
 
 
 def _sided_boxes(kind: str, form: str) -> Field:
-    """Return the field of boxes by place, width and height."""
+    """Return the field of boxes by a point, width and height."""
 
     def write(corners: Tensor) -> Tensor:
         low, high = corners.split(2, -1)
-        return torch.cat((low + _PLACED[kind] * (high - low), high - low), -1)
+        return torch.cat((low + _ANCHORS[kind] * (high - low), high - low), -1)
 
     def check_sides(value: Tensor, name: str, owner: str) -> None:
         _check_form(kind, value, name, owner)
@@ -413,10 +413,10 @@ KINDS = {
         dims=2, ends=SIDES, shape=SHAPE, move=moved_matrix, tells_batches=True, hint=matrix_hint, check=check_matrix
     ),
 }
-BOXES = "boxes", *_PLACED
+BOXES = "boxes", *_ANCHORS
 IMAGES = tuple(kind for kind, field in KINDS.items() if field.is_image)
 PLACE = "crop_place"
-"""The place of a sample's crop, which follows its camera and rotation through all augmentations."""
+"""The field of where a crop looks, seen from the first camera; it follows from a sample's camera and rotation."""
 OWN = ("camera", "source_camera", "source_rotation", "scale", PLACE)  # these follow from the change: no kind moves them
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from camtorch.augment.ranges import Range, draw_numbers, values_for
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import CameraNumbers, opaque
 from camtorch.evaluate.tensors import known_false
@@ -21,7 +23,12 @@ from camtorch.warp.grid import CameraPair
 
 _ROOT = 1.324717957244746  # plastic number: a low-discrepancy sequence in 2D (R2)
 _SHARE_ERROR = 0.01  # largest error of the share that points measure
+_LEAST_SHOWN = 2 / 3  # of what an image shows of its own camera: with less than that, on average, it warns
+_TRIES = 8
 _LEAST_FOV_SHARE = 0.9  # of the least field of view that was asked for: below that a warning says so
+
+NewCamera = Callable[[Camera, Mapping[str, Any]], tuple[Camera, Tensor | None]]
+"""A camera and values -> the camera after and the rotation, as `Augmentation.new_camera`."""
 
 
 def filled(source: Camera, target: Camera, rotation: Tensor | None) -> Tensor:
@@ -129,6 +136,33 @@ def _least_zoom(
     if bool((high == most).any()):  # not measured yet
         at_high = torch.where(high == most, part_shown(high), at_high)
     return high, at_high
+
+
+def warn_if_empty(owner: str, camera: Camera, ranges: Mapping[str, Range], new_camera: NewCamera) -> None:
+    """Warn if new images of `camera` will be mostly empty; draws from a generator of its own show it."""
+    draw = draw_numbers(ranges, _TRIES, 1.0, False, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        first = camera.detach()
+        first = first[[0] * _TRIES] if first.batch_shape else first
+        shares = filled(first, *new_camera(first, values_for(first, draw)))
+        most = filled(first, first, None)  # less than 1 if a fisheye shows a circle
+    if shares.mean() < _LEAST_SHOWN * most.mean():
+        warn(
+            f"{owner}: of the new images {1 - float(shares.mean()):.0%} will show nothing, and of some "
+            f"{1 - float(shares.min()):.0%}, as the camera of the images does not see so far. min_filled=0.9 zooms "
+            "until that much of every image shows something; fov='source', in lenses, takes one as wide as the "
+            "images are; min_filled=0 says that it is meant so"
+        )
+
+
+def warn_of_unfilled(owner: str, share: float, found: Tensor) -> None:
+    """Warn that the parts `found` (*B,) of new images that show something are less than `min_filled`, a `share`."""
+    few = int((found < share).sum())
+    warn(
+        f"{owner}: min_filled must be within reach; got {share:g}, and of {few} of {found.numel()} new images "
+        f"down to {float(found.min()):.0%} shows something: the camera of the images does not see along the axis "
+        "of the new one. Turn it less, or use less of min_filled"
+    )
 
 
 def tell_of_narrow_images(

@@ -67,8 +67,8 @@ INSIGHTFACE = (
     *(52, 64, 63, 71, 67, 68, 61, 58, 59, 53, 56, 55, 65, 66, 62, 70, 69, 57, 60, 54, 38, 92),  # the mouth, pupils
 )
 """The number in "insightface106" of each landmark of "lapa106"."""
-_PLACES = {number: i for i, number in enumerate(INSIGHTFACE)}
-LANDMARKS["insightface106"] = tuple(INSIGHTFACE[LANDMARKS["lapa106"][_PLACES[i]]] for i in range(106))
+_INDEX_IN_INSIGHTFACE = {number: i for i, number in enumerate(INSIGHTFACE)}
+LANDMARKS["insightface106"] = tuple(INSIGHTFACE[LANDMARKS["lapa106"][_INDEX_IN_INSIGHTFACE[i]]] for i in range(106))
 
 TableLike = str | Sequence[int] | Sequence[Sequence[int]]
 
@@ -278,7 +278,7 @@ _RUNS = {  # name -> the first landmark of a run -> its points; the others are m
     "wflw98": {33: _BROW, 51: _BRIDGE + _NOSTRILS, 60: _EYE, 76: _MOUTH, 96: _IRIS},
     "lapa106": {33: _BROW, 51: _BRIDGE + _WING + _NOSTRILS, 66: _EYE + _IRIS, 84: _MOUTH, 104: _IRIS},
 }
-_WITH_PLACES = (*_RUNS, "insightface106", "mediapipe468", "mediapipe478")
+_WITH_POINTS = (*_RUNS, "insightface106", "mediapipe468", "mediapipe478")
 
 
 def face_points(landmarks: str = "ibug68") -> Tensor:
@@ -301,7 +301,7 @@ def face_points(landmarks: str = "ibug68") -> Tensor:
         >>> ct.augment.face_points("mediapipe478").shape
         torch.Size([478, 3])
     """
-    name = one_of(landmarks, _WITH_PLACES, "landmarks", "face_points")
+    name = one_of(landmarks, _WITH_POINTS, "landmarks", "face_points")
     if name == "insightface106":
         return face_points("lapa106")[torch.tensor(INSIGHTFACE).argsort()]
     mesh, order = np.loadtxt(Path(__file__).with_name("mediapipe_face.txt")) / 1e5, LANDMARKS[name]

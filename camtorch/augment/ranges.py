@@ -14,7 +14,6 @@ of these forms:
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -26,15 +25,14 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import has_tangent, is_cheap_to_read, is_eager, keeps_graph
-from camtorch.evaluate.tensors import known_true
-from camtorch.values.arguments import as_number, shown, warn
+from camtorch.evaluate.tensors import are_numbers, known_true
+from camtorch.values.arguments import as_mapping, as_number, shown, warn
 
 RangeLike = float | Sequence[float]
 Draw = Mapping[str, Any]
 """A draw in any of its forms."""
 
 Spans = SimpleNamespace  # by that name pickles of 0.4.0 have one that nothing reads
-_first = operator.itemgetter(0)
 _RADIANS = 0.8  # 45 degrees: a range of degrees within it is more likely in radians
 
 
@@ -153,9 +151,7 @@ def values_for(source: Camera, draw: Draw) -> dict[str, Any]:
     If one camera serves all samples and all draws are equal, the dim *B is left out: one warp serves all.
     """
     if isinstance(draw["apply"], list):  # of one sample
-        values = dict(zip(draw, map(_first, draw.values()), strict=True))  # without a loop of Python
-        del values["apply"]
-        return values
+        return {name: rows[0] for name, rows in draw.items() if name != "apply"}
     values = {name: value for name, value in draw.items() if name != "apply"}
     if source.batch_shape or (len(draw["apply"]) != 1 and not all(map(_are_alike, values.values()))):
         return values
@@ -174,3 +170,47 @@ def as_tensors(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
     """Return values as tensors in the source's dtype and on its device."""
     dtype = torch.promote_types(source.intrinsics.dtype, torch.float32)
     return {n: torch.as_tensor(value, dtype=dtype, device=source.intrinsics.device) for n, value in values.items()}
+
+
+def checked_draw(draw: Mapping[str, Tensor], sizes: Mapping[str, int | None], owner: str) -> Draw:
+    """Return a draw that was given as arrays, or as tensors if numbers may not be read.
+
+    sizes: name -> how many numbers it holds for each sample; None: one, without a dim.
+    """
+    as_mapping(draw, "draw", owner, "what draw() returns")
+    if missing := [name for name in ("apply", *sizes) if name not in draw]:
+        has = ", ".join(map(str, draw)) or "nothing"
+        raise ValueError(f"{owner}: draw must have {', '.join(missing)}; got {has}")
+    values: dict[str, Any] = {name: torch.as_tensor(draw[name]) for name in ("apply", *sizes)}
+    if values["apply"].ndim != 1:
+        raise ValueError(f"{owner}: draw['apply'] must be (B,), which of B samples move; got {shown(draw['apply'])}")
+    values["apply"] = values["apply"] > 0.5
+    if are_numbers(*values.values()):
+        values = {n: (value if n == "apply" else value.double()).numpy() for n, value in values.items()}
+    for name, size in sizes.items():
+        value, count = values[name], len(values["apply"])
+        shape = (count,) if size is None else (count, size)
+        if tuple(value.shape) != shape:
+            raise ValueError(f"{owner}: draw[{name!r}] must be {shape}; got shape {tuple(value.shape)}")
+        if isinstance(value, np.ndarray) and not np.isfinite(value).all():
+            raise ValueError(f"{owner}: draw[{name!r}] must be finite; got {value.tolist()}")
+    return values
+
+
+def chosen_boxes(crops: Mapping[str, int], boxes: Iterable[Tensor] | None, owner: str) -> dict[str, Tensor]:
+    """Return a box of each sample by its name in draws, (B, 4).
+
+    crops: that name -> the index of the box in each sample. boxes: (M, 4) of each sample; None if samples have none.
+    """
+    if boxes is None:
+        raise ValueError(
+            f"{owner}: the sample must have boxes, (B, M, 4) pixels x1, y1, x2, y2, to crop one of; got none"
+        )
+    samples = list(boxes)
+    for i, rows in enumerate(samples):
+        for index in crops.values():
+            if not -len(rows) <= index < len(rows):
+                raise ValueError(f"{owner}: sample {i} must have a box of index {index}; got {len(rows)} boxes")
+    if not samples:
+        return {name: torch.empty(0, 4) for name in crops}
+    return {name: torch.stack([rows[index] for rows in samples]) for name, index in crops.items()}

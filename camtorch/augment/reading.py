@@ -177,10 +177,10 @@ def warn_of_numbers(kind: str, name: str, value: Tensor, flags: Any, size: Seque
         return
     if value.shape[-1] != 3:
         form = "pixels" if are_points else KINDS[kind].shape.partition(") ")[2]
-        places = " from x and y" if kind.startswith("boxes_") else ""
+        of = " from x and y" if kind.startswith("boxes_") else ""
         warn(
             f"{owner}: {name} must be {form}; got values within [0, 1], as parts of an image's sides. Multiply them by "
-            f"width and height, and subtract 0.5{places}"
+            f"width and height, and subtract 0.5{of}"
         )
     elif known_true((value[..., 2] <= 0).any()):
         warn(
@@ -193,14 +193,14 @@ def _are_off(points: Tensor, flags: Any, size: Sequence[int]) -> bool:
     """Whether most points (..., 2), of those that are seen, are off the image by more than a tenth of its sides."""
     if not points.numel() or not is_cheap_to_read(points):
         return False
-    places, sides = points.detach().reshape(-1, 2), (size[1], size[0])
-    ends = zip(places.amin(0).tolist(), places.amax(0).tolist(), sides, strict=True)
+    pixels, sides = points.detach().reshape(-1, 2), (size[1], size[0])
+    ends = zip(pixels.amin(0).tolist(), pixels.amax(0).tolist(), sides, strict=True)
     if all(-_OFF * side < low and high < (1 + _OFF) * side - 1 for low, high, side in ends):  # as in most samples
         return False
-    seen = torch.isfinite(places).all(-1)
+    seen = torch.isfinite(pixels).all(-1)
     if flags is not None and (given := torch.as_tensor(flags)).numel() == len(seen):
         seen = seen & (given.reshape(-1) != 0)
-    off = ((places + 0.5) / places.new_tensor(sides) - 0.5).abs().amax(-1) > 0.5 + _OFF
+    off = ((pixels + 0.5) / pixels.new_tensor(sides) - 0.5).abs().amax(-1) > 0.5 + _OFF
     return int((off & seen).sum()) > int(seen.sum()) / 2
 
 

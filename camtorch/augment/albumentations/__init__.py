@@ -106,7 +106,7 @@ class Transform(FrontEnd, A.DualTransform):
 
     def _read(self, data: dict[str, Any]) -> tuple[Sample, Callable[[Sample], Sample]]:
         """Return targets as `numpy.Transform` takes them, and the function that writes moved ones as given."""
-        camera, places = self._source(data), {}
+        camera, targets = self._source(data), {}
         fields = {} if isinstance(camera, Unknown) else {"camera": camera}
         for i, (name, value) in enumerate(data.items()):
             target = self._additional_targets.get(name, name)
@@ -119,13 +119,13 @@ class Transform(FrontEnd, A.DualTransform):
                 if kind is None:
                     continue
                 field = f"{kind}_{i}"  # a name that begins with a kind is known
-            places[field], fields[field] = (name, target), _given(target, value, camera)
+            targets[field], fields[field] = (name, target), _given(target, value, camera)
 
         def write(moved: Sample) -> Sample:
             change = present(self.augmentation.last, "the change of the call that moved")
-            followed = ("camera", PLACE, "rotation") if PLACE in moved else ("camera",)  # the place follows from both
+            followed = ("camera", PLACE, "rotation") if PLACE in moved else ("camera",)  # it follows from both
             result = data | {name: moved[name] for name in followed if name in moved}
-            for field, (name, target) in places.items():
+            for field, (name, target) in targets.items():
                 seen = moved.get(f"{field}_valid")
                 result[name] = _taken(target, data[name], moved[field], seen, change.parts[0].image_size)
                 if seen is not None and target not in _TARGETS:

@@ -26,8 +26,8 @@ else:
         (Boxes(torch.zeros(1, 1, 4, 2)), "_data _valid"),
         (Keypoints(torch.zeros(1, 1, 2)), "_data"),
     )
-    _parts = [(one, name) for one, names in _NEEDED for name in names.split()]
-    LACK = ", ".join(f"{type(one).__name__}.{name} is missing" for one, name in _parts if not hasattr(one, name))
+    _members = [(one, name) for one, names in _NEEDED for name in names.split()]
+    LACK = ", ".join(f"{type(one).__name__}.{name} is missing" for one, name in _members if not hasattr(one, name))
 if LACK:
     raise ImportError(
         f"camtorch.augment.kornia: kornia must have the parts of 0.9; got {importlib.metadata.version('kornia')}: "
