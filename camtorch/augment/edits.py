@@ -305,16 +305,13 @@ class Rotate90(Edit):
         self.times = ends[0], ends[1], as_whole(step, "step", name, least=1)
         super().__init__({"times": Range(0, 1)}, **options)
 
-    def _size_if_applied(self, size: tuple[int, int]) -> tuple[int, int]:
-        return size[::-1] if self.times[0] % 2 else size
-
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
         (low, high, step), (height, width) = self.times, size
         count = (high - low) // step + 1
         turns = (low + step * (values["times"] * count).floor().clamp(max=count - 1)).long() % 4
         maps = turns.new_tensor(quarter_turns(size), dtype=torch.float64)
         on_side = turns % 2
-        if height != width and known_false(on_side == on_side[:1]):
+        if height != width and on_side.ndim and known_false(on_side == on_side[:1]):
             raise ValueError(
                 f"{self._name}: results of one batch must have one size; got {size} and {size[::-1]}. "
                 "same_on_batch=True turns all alike, step=2 keeps the size"
