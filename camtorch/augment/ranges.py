@@ -14,6 +14,7 @@ of these forms:
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -33,6 +34,7 @@ Draw = Mapping[str, Any]
 """A draw in any of its forms."""
 
 Spans = SimpleNamespace  # by that name pickles of 0.4.0 have one that nothing reads
+_first = operator.itemgetter(0)
 _RADIANS = 0.8  # 45 degrees: a range of degrees within it is more likely in radians
 
 
@@ -151,7 +153,9 @@ def values_for(source: Camera, draw: Draw) -> dict[str, Any]:
     If one camera serves all samples and all draws are equal, the dim *B is left out: one warp serves all.
     """
     if isinstance(draw["apply"], list):  # of one sample
-        return {name: rows[0] for name, rows in draw.items() if name != "apply"}
+        values = dict(zip(draw, map(_first, draw.values()), strict=True))  # without a loop of Python
+        del values["apply"]
+        return values
     values = {name: value for name, value in draw.items() if name != "apply"}
     if source.batch_shape or (len(draw["apply"]) != 1 and not all(map(_are_alike, values.values()))):
         return values
