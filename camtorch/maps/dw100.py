@@ -10,17 +10,16 @@ https://docs.kernel.org/userspace-api/media/drivers/dw100.html
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from camtorch.io.record import CameraFileError
 from camtorch.maps.lookup import Exact, Floats
-from camtorch.maps.mesh import Mesh, Table, rounded, table
+from camtorch.maps.mesh import Mesh, Table, table
 
-_PARTS = 16
-_MOST_PARTS = (1 << 16) - 1
+_FRACTIONS = 16
+_LARGEST = (1 << 16) - 1
 _SMALLEST_SIZE, _LARGEST_SIZE = (144, 176), (3072, 4096)
 
 
@@ -31,18 +30,21 @@ class DW100(Table):
     options: tuple[str, ...] = ("clip",)
     step = 16
     steps: tuple[int, ...] = (16,)
+    fractions = _FRACTIONS
 
-    def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
+    def limits(self, path: str, exact: Exact, places: Floats) -> tuple[Floats, Floats]:
         for what, size in (("source", exact.source_size), ("target", exact.target_size)):
             if any(
                 not low <= side <= high for low, side, high in zip(_SMALLEST_SIZE, size, _LARGEST_SIZE, strict=True)
             ):
                 reason = f"must be 176x144 to 4096x3072 pixels for the DW100; got {size[1]}x{size[0]}"
                 raise CameraFileError(path, f"{what} size", reason)
-        low, high = np.zeros(2), np.full(2, _MOST_PARTS / _PARTS)
-        parts = rounded(path, self.name, mesh, exact, _PARTS, low, high, bool(options.get("clip")))
+        return np.zeros(2), np.full(2, _LARGEST / _FRACTIONS)
+
+    def pack(self, path: str, mesh: Mesh, exact: Exact) -> tuple[bytes, dict[str, Any]]:
+        parts = (mesh.nodes * _FRACTIONS).astype(np.int64)
         return (parts[..., 1] << 16 | parts[..., 0]).astype("<u4").tobytes(), {}
 
     def unpack(self, content: bytes, blank: Mesh) -> Floats:
         words = table(content, "<u4", blank.nodes.shape[:2])
-        return np.stack((words & _MOST_PARTS, words >> 16), -1) / _PARTS
+        return np.stack((words & _LARGEST, words >> 16), -1) / _FRACTIONS

@@ -30,7 +30,6 @@ class Mesh:
 
     step: int
     nodes: Floats  # (n, m, 2), x and y in pixels of the source
-    needed: Bools | None = None  # (n, m): nodes of blocks with a pixel that the warp shows; None if the mesh was read
 
     @property
     def places(self) -> Floats:
@@ -52,10 +51,19 @@ class Table(MapFormat):
     described = True
     step: int  # pixels of the target between nodes, by default
     steps: Sequence[int]
+    fractions: int  # of a pixel, in which positions are whole numbers
 
     @abstractmethod
-    def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        """Return the bytes of a mesh's file, and what its description needs in addition to step and number of nodes."""
+    def limits(self, path: str, exact: Exact, places: Floats) -> tuple[Floats, Floats]:
+        """Return the least and the largest positions that nodes at these places (n, m, 2) of the target may have.
+
+        Raises:
+            CameraFileError: If the format does not hold images of these sizes.
+        """
+
+    @abstractmethod
+    def pack(self, path: str, mesh: Mesh, exact: Exact) -> tuple[bytes, dict[str, Any]]:
+        """Return the bytes of a rounded mesh, and what its description needs beside step and number of nodes."""
 
     @abstractmethod
     def unpack(self, content: bytes, blank: Mesh) -> Floats:
@@ -80,8 +88,19 @@ class Table(MapFormat):
         low, high = -_REACH * sides, (1 + _REACH) * sides
         # nodes far off are no basis for extrapolation
         nodes = _continued(np.where(needed[..., None], nodes, nodes.clip(low, high)), mapped, low, high)
-        mesh = Mesh(step, nodes, needed)
-        content, facts = self.pack(path, mesh, exact, options)
+        mesh = Mesh(step, nodes)
+        low, high = self.limits(path, exact, mesh.places)
+        beyond = needed & ((nodes < low - _SLACK) | (nodes > high + _SLACK)).any(-1)
+        if beyond.any() and not options.get("clip"):
+            (left, top), (right, bottom) = nodes[beyond].min(0), nodes[beyond].max(0)
+            raise CameraFileError(
+                path,
+                f"{int(beyond.sum())} of {int(needed.sum())} vertices",
+                f"must fit in {self.name}; got x {left:.1f} to {right:.1f}, y {top:.1f} to {bottom:.1f} px of the "
+                "source. clip=True (--clip) clips them, and the report has the error",
+            )
+        mesh = rounded(mesh, exact, self.fractions, low, high)
+        content, facts = self.pack(path, mesh, exact)
         return content, {"step": mesh.step, "nodes": mesh.nodes.shape[:2], **facts}
 
     def decode(self, content: bytes, described: Mapping[str, Any]) -> LookupMap:
@@ -142,36 +161,20 @@ def _continued(nodes: Floats, known: Bools, low: Floats, high: Floats) -> Floats
     return nodes
 
 
-def rounded(
-    path: str, format: str, mesh: Mesh, exact: Exact, parts: int, low: Floats, high: Floats, clip: bool
-) -> np.ndarray:
-    """Return the nodes (n, m, 2) int64 in `parts` of a pixel, so that the largest error at shown pixels is small.
+def rounded(mesh: Mesh, exact: Exact, fractions: int, low: Floats, high: Floats) -> Mesh:
+    """Return the mesh with nodes in whole `fractions` of a pixel, so that the largest error at shown pixels is small.
 
     Each is one of the two neighbours of the exact value, from low to high. Interpolation cuts off bends, so nodes are
     rounded outwards first; then those near the largest error are rounded to reduce it, as long as that helps.
-
-    Raises:
-        CameraFileError: If nodes of shown pixels are far below `low` or above `high`, unless `clip` is True.
     """
-    beyond = ((mesh.nodes < low - _SLACK) | (mesh.nodes > high + _SLACK)).any(-1)
-    lost = beyond if mesh.needed is None else beyond & mesh.needed
-    if mesh.needed is not None and not clip and lost.any():
-        worst = mesh.nodes[lost]
-        (left, top), (right, bottom) = worst.min(0), worst.max(0)
-        raise CameraFileError(
-            path,
-            f"{int(lost.sum())} of {int(mesh.needed.sum())} vertices",
-            f"must fit in {format}; got x {left:.1f} to {right:.1f}, y {top:.1f} to {bottom:.1f} px of the source. "
-            "clip=True (--clip) clips them, and the report has the error",
-        )
     held = mesh.nodes.clip(low, high)
-    values, least, most = held * parts, low * parts, high * parts
+    values, least, most = held * fractions, low * fractions, high * fractions
     total = np.zeros_like(held)  # sum of second differences along both axes; the ends copy their neighbours
     for axis in (0, 1):
         if held.shape[axis] > 2:
             bend = np.diff(held, 2, axis)
             total += np.concatenate((bend.take([0], axis), bend, bend.take([-1], axis)), axis)
-    outside = (_OUTWARDS * total * parts).clip(-0.5, 0.5)
+    outside = (_OUTWARDS * total * fractions).clip(-0.5, 0.5)
     nodes = np.rint(values - outside).clip(least, most)
     either = np.floor(values).clip(least, most), np.ceil(values).clip(least, most)
     edge = np.array(exact.source_size[::-1], np.float64) - 1
@@ -179,7 +182,7 @@ def rounded(
 
     def errors(nodes: Floats, pixels: tuple[slice, ...]) -> Floats:
         height, width = shown[pixels].shape
-        off = Mesh(mesh.step, nodes / parts).positions((height, width)).clip(0, edge) - wanted[pixels]
+        off = Mesh(mesh.step, nodes / fractions).positions((height, width)).clip(0, edge) - wanted[pixels]
         distance: Floats = np.hypot(off[..., 0], off[..., 1]) * shown[pixels]
         return distance
 
@@ -204,5 +207,4 @@ def rounded(
             break
         node, value, pixels, off = best
         nodes[node], error[pixels] = value, off
-    whole: np.ndarray = nodes.astype(np.int64)
-    return whole
+    return Mesh(mesh.step, nodes / fractions)

@@ -13,17 +13,15 @@ Technical reference manuals, e.g. SPRUJ28, "LDC Lens Distortion Back-Mapping" an
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from camtorch.io.record import CameraFileError
 from camtorch.maps.lookup import Exact, Floats
-from camtorch.maps.mesh import Mesh, Table, rounded, table
+from camtorch.maps.mesh import Mesh, Table, table
 
-_PARTS = 8
+_FRACTIONS = 8
 _LOW, _HIGH = -(1 << 15), (1 << 15) - 1
 _ALIGNMENT_BYTES = 16
 _LARGEST_SIDE = 8192  # pixels
@@ -39,24 +37,25 @@ class TILDC(Table):
     options: tuple[str, ...] = ("step", "clip")
     step = 8
     steps: tuple[int, ...] = tuple(1 << m for m in range(8))
+    fractions = _FRACTIONS
 
-    def pack(self, path: str, mesh: Mesh, exact: Exact, options: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
+    def limits(self, path: str, exact: Exact, places: Floats) -> tuple[Floats, Floats]:
         if max(*exact.source_size, *exact.target_size) > _LARGEST_SIDE:
             raise CameraFileError(path, "size", f"sides must be at most {_LARGEST_SIDE} px for the LDC; got more")
-        (n, m), places = mesh.nodes.shape[:2], mesh.places
-        limits = places + _LOW / _PARTS, places + _HIGH / _PARTS
-        parts = rounded(path, self.name, mesh, exact, _PARTS, *limits, bool(options.get("clip")))
+        return places + _LOW / _FRACTIONS, places + _HIGH / _FRACTIONS
+
+    def pack(self, path: str, mesh: Mesh, exact: Exact) -> tuple[bytes, dict[str, Any]]:
+        n, m = mesh.nodes.shape[:2]
         lines = np.zeros((n, _pitch(m) // 2), "<i2")
-        lines[:, : 2 * m] = (parts - places * _PARTS).reshape(n, -1)
-        positions = replace(mesh, nodes=parts / _PARTS).positions(exact.target_size)
-        size, padding, largest = _fetched(path, positions, exact.source_size)
+        lines[:, : 2 * m] = ((mesh.nodes - mesh.places) * _FRACTIONS).reshape(n, -1)
+        size, padding, largest = _fetched(path, mesh.positions(exact.target_size), exact.source_size)
         facts = {"line_offset": _pitch(m), "block_size": size, "pixel_padding": padding, "source_block": largest}
         return lines.tobytes(), facts
 
     def unpack(self, content: bytes, blank: Mesh) -> Floats:
         n, m = blank.nodes.shape[:2]
         lines = table(content, "<i2", (n, _pitch(m) // 2))
-        return blank.places + lines[:, : 2 * m].reshape(n, m, 2) / _PARTS
+        return blank.places + lines[:, : 2 * m].reshape(n, m, 2) / _FRACTIONS
 
 
 def _pitch(columns: int) -> int:

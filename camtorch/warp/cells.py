@@ -160,7 +160,7 @@ def settle(
     doubt = cells == CELL_DOUBT
     if not bool(doubt.any()):
         return
-    chosen, wanted = places(doubt)
+    chosen, wanted = indices_of(doubt)
     corners = torch.stack((chosen % cells.shape[2], chosen // cells.shape[2]), -1) * STEP
     corners[..., 1] += first
     positions, known = exact(corners.unsqueeze(2) + nodes.new_tensor(_PROBES))
@@ -211,10 +211,10 @@ def prefer_quintics(nodes: Tensor, cells: Tensor, source: tuple[int, int], toler
     cells.masked_fill_((cells == CELL_CUBIC) & (across + down <= tolerance * tolerance / 4), CELL_QUINTIC)
 
 
-def places(todo: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the places (B, K) of the cells that are True in `todo` (B, n, m), and bool (B, K): which of them count.
+def indices_of(todo: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the indices (B, K) of the cells that are True in `todo` (B, n, m), and bool (B, K): which of them count.
 
-    K is the largest number of such cells of any camera. Cameras with fewer have places of other cells as well, which
+    K is the largest number of such cells of any camera. Cameras with fewer have indices of other cells as well, which
     do not count.
     """
     flat = todo.flatten(1)
@@ -238,7 +238,7 @@ def lay_exact(exact: Exact, like: Tensor, first: int, cells: Tensor, todo: Tenso
     done = torch.zeros_like(todo)
     offset = torch.arange(STEP, dtype=like.dtype, device=like.device)
     while bool(todo.any()):
-        chosen, wanted = places(todo)
+        chosen, wanted = indices_of(todo)
         i, j = chosen // todo.shape[2], chosen % todo.shape[2]
         down = i[..., None, None] * STEP + offset[:, None]
         across = j[..., None, None] * STEP + offset
@@ -259,17 +259,17 @@ def lay_exact(exact: Exact, like: Tensor, first: int, cells: Tensor, todo: Tenso
 def lay_quintics(nodes: Tensor, cells: Tensor, count: int) -> Tensor:
     """Return positions (2, K, 8, 8) of all `CELL_QUINTIC`, and write their places, from `count` on, into `cells`."""
     some = cells == CELL_QUINTIC
-    camera, place = some.flatten(1).nonzero(as_tuple=True)
-    if not len(place):
+    camera, index = some.flatten(1).nonzero(as_tuple=True)
+    if not len(index):
         return nodes.new_empty(2, 0, STEP, STEP)
-    cells[some] = torch.arange(count, count + len(place), dtype=cells.dtype, device=cells.device)
+    cells[some] = torch.arange(count, count + len(index), dtype=cells.dtype, device=cells.device)
     weights = lagrange(6, nodes.device)
     # torch may be told to multiply matrices of less than float64 in fewer bits
-    around = _around(nodes, camera, place).double()
+    around = _around(nodes, camera, index).double()
     return (weights @ around @ weights.mT).to(nodes.dtype).transpose(0, 1)
 
 
-def _around(nodes: Tensor, camera: Tensor, place: Tensor) -> Tensor:
+def _around(nodes: Tensor, camera: Tensor, index: Tensor) -> Tensor:
     """Return the nodes (*K, c, 6, 6) around cells of a camera each, of all nodes (B, c, n + 5, m + 5)."""
     columns = nodes.shape[-1] - 5
-    return nodes.unfold(2, 6, 1).unfold(3, 6, 1)[camera, :, place // columns, place % columns]
+    return nodes.unfold(2, 6, 1).unfold(3, 6, 1)[camera, :, index // columns, index % columns]

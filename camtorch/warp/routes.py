@@ -54,14 +54,14 @@ _MOST_CALLS = 8  # forms of images for which a call is kept
 _FLOAT32_TOLERANCE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels wide
 
 
-def _part(held: str, name: str) -> Any:
-    """Return a property of a module's part, read from its usual dict; `nn.Module.__getattr__` looks in all."""
+def _held_in(usual: str, name: str) -> Any:
+    """Return a property for what a module holds in its `usual` dict; `nn.Module.__getattr__` looks in all of them."""
 
-    def part(module: nn.Module) -> Any:
-        parts = module.__dict__[held]
-        return parts[name] if name in parts else nn.Module.__getattr__(module, name)
+    def held(module: nn.Module) -> Any:
+        values = module.__dict__[usual]
+        return values[name] if name in values else nn.Module.__getattr__(module, name)
 
-    return property(part)
+    return property(held)
 
 
 class KeptPositions:
@@ -98,9 +98,9 @@ class RoutedWarp(GeometryModule):
     joins_earlier: ClassVar[bool] = False  # True: after another warp both are one, `between` the cameras of that
     keeps_depth: ClassVar[bool] = False  # True: depths along the axis stay, as the camera does
     may_mirror: ClassVar[bool] = False  # True: the rotation may be a mirror
-    source: Camera = _part("_modules", "source")
-    target: Camera = _part("_modules", "target")
-    rotation: Tensor | None = _part("_buffers", "rotation")
+    source: Camera = _held_in("_modules", "source")
+    target: Camera = _held_in("_modules", "target")
+    rotation: Tensor | None = _held_in("_buffers", "rotation")
     batch_shape: torch.Size
     mode: Mode
     padding_mode: PaddingMode
@@ -198,8 +198,8 @@ class RoutedWarp(GeometryModule):
     @property
     def pair(self) -> CameraPair:
         """Source, target and rotation by which pixels move: cameras that have shutters are behind them."""
-        parts: Any = self._modules
-        return CameraPair(parts["source"], parts["target"], self.rotation)
+        modules: Any = self._modules
+        return CameraPair(modules["source"], modules["target"], self.rotation)
 
     @property
     def seam(self) -> Seam | None:
@@ -275,8 +275,8 @@ class RoutedWarp(GeometryModule):
         if route == "strips":
             cameras = math.prod(self.batch_shape)
             result = maker(images, len(images) if cameras == 1 else cameras, self.image_size)()
-            for rows, part, _ in self.in_strips(images, sampler):
-                result[:, :, rows] = part
+            for rows, strip, _ in self.in_strips(images, sampler):
+                result[:, :, rows] = strip
             return result
         given, images = images, self.lengthened(images)
         if route == "operator":
@@ -361,8 +361,8 @@ class RoutedWarp(GeometryModule):
         images = self.lengthened(images)
         for rows, where in self.strip_positions(sampler.padding_mode, count):
             with torch.no_grad():
-                part = render(images, where, sampler, pyramids)
-            yield rows, part, where
+                strip = render(images, where, sampler, pyramids)
+            yield rows, strip, where
 
     def on_image(self, where: Positions) -> Tensor:
         """Whether the source maps pixels onto its image, (B or 1, 1, h, W')."""

@@ -210,7 +210,7 @@ class Warp(RoutedWarp):
         if isinstance(images, Tensor) and images.ndim != 4:
             raise ValueError(f"Warp: images must be (B, C, H, W) for strips; got shape {tuple(images.shape)}")
         strips = self.in_strips(images, checked(self, images, mode, padding_mode, fill), rows)
-        return ((rows, part, self.on_image(where)) for rows, part, where in strips)
+        return ((rows, strip, self.on_image(where)) for rows, strip, where in strips)
 
     def grid(self) -> Tensor:
         """Return positions (B or 1, H', W', 2) for `grid_sample(..., align_corners=False)`; -9 for none."""
