@@ -7,7 +7,7 @@ positions of its pixels: `lay_exact` does so, and `lay_quintics`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -29,9 +29,8 @@ from camtorch.native.structs import (
 )
 from camtorch.warp.lattice import Lattice, lagrange, probes
 
-Exact = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Pixels (h, w, 2) for every camera, or (B, h, w, 2) for each its own, to positions (B or 1, h, w, 2) as of
-`grid_sample`, `OUTSIDE` where no ray is mapped, and bool (B or 1, h, w): whether one is."""
+if TYPE_CHECKING:
+    from camtorch.warp.grid import CameraPair
 
 _MISSED_BY_QUINTICS = 5.5 * 5 / 1024
 """How far quintics miss at most, over the nodes' sixth differences: 5 / 1024 if these are even, and 5.5 times as far
@@ -43,25 +42,18 @@ _MIDDLE = {4: (0.0, -1 / 16, 9 / 16, 9 / 16, -1 / 16, 0.0), 6: tuple(w / 256 for
 
 
 def found_by_torch(
-    exact: Exact,
-    like: Tensor,
-    first: int,
-    size: tuple[int, int],
-    source: tuple[int, int],
-    tolerance: float,
-    padding: str,
-    learns: bool,
+    cameras: CameraPair, first: int, size: tuple[int, int], tolerance: float, padding: str, learns: bool
 ) -> Lattice | None:
     """Return the lattice of `grid.on_lattice` by torch, as of several models in a batch, or without the library.
 
-    like: has the dtype and the device of pixels. first, size: of the rows of the target. source: the size of its image.
     learns: whether nodes and exact cells are computed again with a graph.
     """
     n, m = (math.ceil(side / STEP) for side in size)
+    source = cameras.source.size_for("Warp")
     # the library finds cubics for each cell; torch alone first looks one node further, whether quintics do everywhere
     looks_further = not (learns or native_available())
     shape = (n + 7, m + 7) if looks_further else (n + 5, m + 5)
-    positions, mapped = (t[:, 0] for t in exact(probes(first, size, like.dtype, shape[0] - n)))
+    positions, mapped = (t[:, 0] for t in cameras.exact(probes(first, size, cameras.like.dtype, shape[0] - n)))
     count = math.prod(shape)  # after so many nodes the rim follows
     nodes = positions[:, :count].movedim(-1, 1).contiguous().unflatten(2, shape)
     if looks_further:
@@ -76,14 +68,14 @@ def found_by_torch(
     mapped = mapped[:, 1:-1, 1:-1].contiguous() if looks_further else mapped
     find = sampler.classify if native_available() else classify
     cells = find(narrow, mapped, rim, size, source, tolerance, padding)
-    settle(exact, first, cells, narrow, mapped, source, tolerance, padding)
+    settle(cameras, first, cells, narrow, mapped, source, tolerance, padding)
     todo = cells == CELL_TODO
     if not len(cells) or int(todo.sum((1, 2)).max()) > n * m * (1 / 5 if learns else 7 / 8):
         return None
-    laid = lay_exact(exact, like, first, cells, todo)
+    exact = lay_exact(cameras, first, cells, todo)
     if not learns:
-        laid = torch.cat((laid, lay_quintics(nodes, cells, laid.shape[1])), 1)
-    return Lattice(nodes, cells, laid, size)
+        exact = torch.cat((exact, lay_quintics(nodes, cells, exact.shape[1])), 1)
+    return Lattice(nodes, cells, exact, size)
 
 
 def classify(
@@ -143,7 +135,7 @@ def _largest(values: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def settle(
-    exact: Exact,
+    cameras: CameraPair,
     first: int,
     cells: Tensor,
     nodes: Tensor,
@@ -163,10 +155,10 @@ def settle(
     chosen, wanted = indices_of(doubt)
     corners = torch.stack((chosen % cells.shape[2], chosen // cells.shape[2]), -1) * STEP
     corners[..., 1] += first
-    positions, known = exact(corners.unsqueeze(2) + nodes.new_tensor(_PROBES))
+    positions, known = cameras.exact(corners.unsqueeze(2) + nodes.new_tensor(_PROBES))
     positions = positions.movedim(-1, 2).to(nodes.dtype)  # (B, K, 2, 5)
-    cameras = torch.arange(len(cells), device=cells.device)[:, None]
-    around = _around(nodes, cameras, chosen)  # (B, K, 2, 6, 6)
+    camera = torch.arange(len(cells), device=cells.device)[:, None]
+    around = _around(nodes, camera, chosen)  # (B, K, 2, 6, 6)
     half = nodes.new_tensor(source[::-1]) / 2
     limit = tolerance * tolerance / 4
 
@@ -188,7 +180,7 @@ def settle(
         is_off = (by_cubics.amax(-1) < 1) & ((high + reach < -1) | (low - reach > 1))
         is_cubic |= is_off.any(-1)
     # a quarter of that, and of what cubics miss: where the curvature steps, quintics gain nothing, and swing
-    inside = _around(mapped[:, None], cameras, chosen).flatten(2).all(-1)
+    inside = _around(mapped[:, None], camera, chosen).flatten(2).all(-1)
     is_quintic = inside & (missed(6).sum(2).amax(-1) <= limit / 16)
     kinds = torch.where(is_quintic, CELL_QUINTIC, CELL_TODO).masked_fill_(is_cubic, CELL_CUBIC)
     kinds.masked_fill_(~known.all(-1), CELL_TODO)
@@ -228,11 +220,12 @@ def put(cells: Tensor, chosen: Tensor, wanted: Tensor, kinds: Tensor) -> None:
     flat.scatter_(1, chosen, torch.where(wanted, kinds.to(cells.dtype), flat.gather(1, chosen)))
 
 
-def lay_exact(exact: Exact, like: Tensor, first: int, cells: Tensor, todo: Tensor) -> Tensor:
+def lay_exact(cameras: CameraPair, first: int, cells: Tensor, todo: Tensor) -> Tensor:
     """Return exact positions (2, K, 8, 8) of the cells to do (B, n, m), and write their places into `cells`.
 
     Where what is mapped ends in one, its neighbours follow.
     """
+    like = cameras.like
     parts = [like.new_empty(2, 0, STEP, STEP)]
     count = 0  # of the cells laid so far, whose numbers are their places
     done = torch.zeros_like(todo)
@@ -243,7 +236,7 @@ def lay_exact(exact: Exact, like: Tensor, first: int, cells: Tensor, todo: Tenso
         down = i[..., None, None] * STEP + offset[:, None]
         across = j[..., None, None] * STEP + offset
         pixels = torch.stack(torch.broadcast_tensors(across, down + first), -1)  # (B, most, 8, 8, 2)
-        positions, known = exact(pixels.flatten(2, 3))
+        positions, known = cameras.exact(pixels.flatten(2, 3))
         part = torch.where(known, positions.movedim(-1, 0), torch.nan)
         parts.append(part.flatten(1, 2).unflatten(-1, (STEP, STEP)))
         put(cells, chosen, wanted, torch.arange(count, count + chosen.numel(), device=cells.device).view_as(chosen))

@@ -79,12 +79,29 @@ class CameraPair(NamedTuple):
         moved, mapped = self.target.project(turn(self.rotation, rays, "pixels"))
         return placed(self.target, moved, mapped & has_ray, on_image)
 
+    @property
+    def like(self) -> Tensor:
+        """A tensor of the dtype and on the device to compute with the target's pixels in."""
+        like = self.target.intrinsics
+        return like if like.dtype.itemsize >= 4 else like.float()
+
+    def pixels_of(self, rows: range) -> Tensor:
+        """Return the centres (len(rows), W', 2) of the target's pixels."""
+        like = self.like
+        v = torch.arange(rows.start, rows.stop, dtype=like.dtype, device=like.device)
+        u = torch.arange(self.target.size_for("Warp")[1], dtype=like.dtype, device=like.device)
+        return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+
     def native_positions(self) -> NativeMove | None:
         """Return the native geometry from target to source; None in a graph, and for images of a whole turn."""
-        return None if self.goes_round else self.back.native(like_pixels_of(self.target))
+        return None if self.goes_round else self.back.native(self.like)
 
     def exact(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return where the source sees target pixels (h, w, 2) or (B, h, w, 2), by torch; see `cells.Exact`."""
+        """Return where the source sees pixels of the target, by torch.
+
+        Pixels (h, w, 2) are those of every camera, and (B, h, w, 2) of each its own. Returns positions (B or 1, h, w,
+        2) as of `grid_sample`, `OUTSIDE` where no ray is mapped, and bool (B or 1, h, w): whether one is.
+        """
         source, target, rotation = self
         if pixels.ndim == 3 and target.batch_shape:
             pixels = pixels.expand(*target.batch_shape, *pixels.shape)
@@ -134,14 +151,14 @@ def scaled_rows(
 
 
 def _row_by_row(cameras: CameraPair, rows: range) -> tuple[Tensor, Tensor]:
-    """Return the exact sampling positions of rows of a target, and which are mapped, see `Exact`."""
+    """Return the exact sampling positions of rows of a target, and which are mapped; see `CameraPair.exact`."""
     target = cameras.target
     if is_unknown(target.intrinsics):
-        return cameras.exact(pixels_of_rows(target, rows))
+        return cameras.exact(cameras.pixels_of(rows))
     native = cameras.native_positions()
 
     def exact(part: range) -> tuple[Tensor, Tensor]:
-        pixels = pixels_of_rows(target, part)
+        pixels = cameras.pixels_of(part)
         if native is None:
             return cameras.exact(pixels)
         found, mapped = native.rows(pixels.flatten(0, 1)[None], POSITIONS)
@@ -159,20 +176,6 @@ def _row_by_row(cameras: CameraPair, rows: range) -> tuple[Tensor, Tensor]:
     for i in range(step, len(rows), step):
         grid[:, i : i + step], mapped[:, i : i + step] = exact(rows[i : i + step])
     return grid, mapped
-
-
-def like_pixels_of(target: Camera) -> Tensor:
-    """Return a tensor of the dtype and on the device to compute with a target's pixels in."""
-    like = target.intrinsics
-    return like if like.dtype.itemsize >= 4 else like.float()
-
-
-def pixels_of_rows(target: Camera, rows: range) -> Tensor:
-    """Return the centres of a target's pixels, (len(rows), W', 2), in the dtype to compute positions in."""
-    like = like_pixels_of(target)
-    v = torch.arange(rows.start, rows.stop, dtype=like.dtype, device=like.device)
-    u = torch.arange(target.size_for("Warp")[1], dtype=like.dtype, device=like.device)
-    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
 
 
 def local_scale(grid: Tensor, mapped: Tensor, source: Camera) -> Tensor:
@@ -228,12 +231,11 @@ def _learning(cameras: CameraPair, first: int, size: tuple[int, int], tolerance:
     if found is None:
         return None
     cells, shape = found.cells, found.nodes.shape[2:]
-    like = like_pixels_of(target)
-    pixels = probes(first, size, like.dtype)[:, : shape.numel()]
+    pixels = probes(first, size, cameras.like.dtype)[:, : shape.numel()]
     nodes = cameras.exact(pixels)[0][:, 0].movedim(-1, 1).unflatten(2, shape)
     if not nodes.requires_grad:
         cells.masked_fill_(cells == CELL_QUINTIC, CELL_TODO)
-    exact = lay_exact(cameras.exact, like, first, cells, cells >= 0)
+    exact = lay_exact(cameras, first, cells, cells >= 0)
     if nodes.requires_grad:
         prefer_quintics(nodes.detach(), cells, source.size_for("Warp"), tolerance)
     return Lattice(nodes, cells, exact, size)
@@ -261,7 +263,6 @@ def _found(
     """Return the lattice of `on_lattice` without a graph; if it `learns`, the one that `_learning` begins with."""
     native = cameras.native_positions()
     if native is None:
-        source_size, like = cameras.source.size_for("Warp"), like_pixels_of(cameras.target)
-        return found_by_torch(cameras.exact, like, first, size, source_size, tolerance, padding, learns)
+        return found_by_torch(cameras, first, size, tolerance, padding, learns)
     made = native.lattices(probes(first, size, native.dtype), size, first, tolerance, padding, learns)
     return None if made is None else Lattice(*made, size)

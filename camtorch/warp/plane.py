@@ -14,7 +14,7 @@ from camtorch.evaluate.tensors import as_own, known_false, values_of
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, turn
 from camtorch.values.arguments import Numbers, as_batch, as_coordinates, as_number, as_real, shown
-from camtorch.warp.grid import pixels_of_rows, placed, scaled_rows
+from camtorch.warp.grid import placed, scaled_rows
 from camtorch.warp.lattice import PixelPositions, to_positions
 from camtorch.warp.options import PaddingMode, WarpOptions
 from camtorch.warp.panorama import off_poles
@@ -121,7 +121,7 @@ class PlaneWarp(Warp):
         return scaled_rows(self.sampled.source, rows, self.image_size[0], self._of_rows)
 
     def _of_rows(self, rows: range) -> tuple[Tensor, Tensor]:
-        pixels = pixels_of_rows(self.target, rows)
+        pixels = self.pair.pixels_of(rows)
         batch = self.batch_shape or (1,)
         seen, mapped = self.move(pixels.expand(*batch, *pixels.shape), back=True)
         if self.seam is not None:
