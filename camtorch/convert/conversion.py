@@ -42,7 +42,8 @@ def convert(
     max_angle = None if max_angle is None else as_number(max_angle, "max_angle", owner)
     if max_angle is not None and not 0 < max_angle <= math.pi * (1 + 1e-6):
         raise ValueError(f"{owner}: max_angle must be positive radians, up to pi; got {max_angle}")
-    if not (tolerance := as_number(tolerance, "tolerance", owner)) > 0:
+    tolerance = as_number(tolerance, "tolerance", owner)
+    if not tolerance > 0:
         raise ValueError(f"{owner}: tolerance must be positive; got {tolerance}")
     if count is None:
         least = default_count(model, source, models)
@@ -65,8 +66,7 @@ def convert(
     parts = []
     for intrinsics, distortion in zip(*(t.split(_ROWS) for t in tensors), strict=True):
         rays = reference(remade(source, intrinsics=intrinsics, distortion=distortion), image_size, limit)
-        task = _Task(rays, model, models, build, image_size, limit, tolerance)
-        parts.append(_with_fewest_coefficients(task, counts))
+        parts.append(_with_fewest_coefficients(_Task(rays, model, models, build, tolerance), counts))
     most = max(part.parameters.shape[-1] for part in parts)
     result = _Result(*map(torch.cat, zip(*(part.padded(most) for part in parts), strict=True)))
     camera = build(result.parameters.reshape(*batch, most)).freeze_like(source)
@@ -76,18 +76,13 @@ def convert(
 
 
 class _Task(NamedTuple):
+    """Cameras (C,) to convert."""
+
     source: Reference
     model: type[CameraLike]
     models: Mapping[str, type[CameraLike]]
     build: Callable[[Tensor], CameraLike]
-    image_size: tuple[int, int] | None
-    limit: float
     tolerance: float
-
-    def of(self, rows: Tensor) -> _Task:
-        intrinsics, distortion = (t[rows] for t in self.source.camera.tensors)
-        camera = remade(self.source.camera, intrinsics=intrinsics, distortion=distortion)
-        return self._replace(source=self.source.of(camera, rows))
 
 
 class _Result(NamedTuple):
@@ -100,18 +95,13 @@ class _Result(NamedTuple):
     valid_fraction: Tensor
     exact: Tensor
 
-    def replaced(self, rows: Tensor, other: _Result) -> _Result:
-        """Return the results with those of `other` at `rows`."""
-        if len(rows) == 0:
+    def replaced(self, which: Tensor, other: _Result) -> _Result:
+        """Return the results with those of `other` where `which`, bool (C,), is true."""
+        if not bool(which.any()):
             return self  # without padding
         width = max(self.parameters.shape[-1], other.parameters.shape[-1])
-        results = _Result(*(t.clone() for t in self.padded(width)))
-        for result, new in zip(results, other.padded(width), strict=True):
-            result[rows] = new
-        return results
-
-    def of(self, rows: Tensor) -> _Result:
-        return _Result(*(t[rows] for t in self))
+        parameters, *numbers = zip(other.padded(width), self.padded(width), strict=True)
+        return _Result(torch.where(which[:, None], *parameters), *(torch.where(which, *pair) for pair in numbers))
 
     def padded(self, width: int) -> _Result:
         """Return the results with parameters (C, width), filled with zeros."""
@@ -123,46 +113,47 @@ def _with_fewest_coefficients(task: _Task, counts: tuple[int, ...]) -> _Result:
     """Convert each row with the first of `counts` within the tolerance, or with the last one that halved the error."""
     result = _convert(task, counts[0])
     for count in counts[1:]:
-        rows = ((result.max_error > task.tolerance) & result.max_error.isfinite()).nonzero()[:, 0]
-        if len(rows) == 0:
+        wanting = (result.max_error > task.tolerance) & result.max_error.isfinite()
+        if not bool(wanting.any()):
             break
-        other = _convert(task.of(rows), count)
-        enough = (_WORTH_IT * result.max_error[rows]).clamp(min=task.tolerance)
-        good = (other.max_error <= enough) & _reaches_as_far(other.max_angle, result.max_angle[rows])
-        result = result.replaced(rows[good], other.of(good))
+        other = _convert(task, count)
+        enough = (_WORTH_IT * result.max_error).clamp(min=task.tolerance)
+        good = wanting & (other.max_error <= enough) & _reaches_as_far(other, result)
+        result = result.replaced(good, other)
     return result
 
 
-def _reaches_as_far(angle: Tensor, before: Tensor) -> Tensor:
-    return angle >= before * (1 - 1e-9)  # rounding depends on the batch
+def _reaches_as_far(result: _Result, before: _Result) -> Tensor:
+    return result.max_angle >= before.max_angle * (1 - 1e-9)  # but for rounding
 
 
 def _convert(task: _Task, count: int) -> _Result:
     source, model, build = task.source.camera, task.model, task.build
     names = model.names_of(count) or ()
     slopes = views.focal_at_axis(source)
-    samples = views.sample(source, task.image_size, _FIT_SIDE, task.limit)
+    samples = views.sample(source, task.source.image_size, _FIT_SIDE, task.source.lattice.limit)
     starts = model.fit_start(names, *views.radii(source, slopes, task.source.reach))
     exact = torch.zeros(len(slopes), dtype=torch.bool, device=slopes.device)
     parameters = torch.cat((slopes, starts[0]), -1)
     usable = torch.isfinite(source.distortion).all(-1) & torch.isfinite(source.intrinsics).all(-1)
     carried = carry_over(source, source.distortion.nan_to_num(0.0, 0.0, 0.0), model, names, task.models)
     if carried is not None:
-        taken, exact = carried[0], carried[1] & usable & (source.intrinsics[:, :2] > 0).all(-1)
+        taken, lossless = carried
+        exact = lossless & usable & (source.intrinsics[:, :2] > 0).all(-1)
         starts = torch.cat((starts, taken[None]))
         parameters = torch.where(exact[:, None], torch.cat((source.intrinsics, taken), -1), parameters)
-    if len(rows := (~exact).nonzero()[:, 0]):
-        parameters[rows] = fit(build(parameters), samples.of(rows), starts[:, rows], slopes[rows])
+    if not bool(exact.all()):
+        fitted = fit(build(parameters), samples, starts, slopes)
+        parameters = torch.where(exact[:, None], parameters, fitted)
     result = _measure(task, parameters, exact)
     # the largest error of any camera of the model is at least the least rms
-    rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
-    if len(rows):
-        these = task.of(rows)
-        observations = views.with_rings(samples.of(rows), these.source.camera, task.image_size)
-        minimax = _measure(these, refine_minimax(build(parameters), observations, parameters[rows]), exact[rows])
-        better = minimax.max_error < result.max_error[rows]
-        better &= _reaches_as_far(minimax.max_angle, result.max_angle[rows])
-        result = result.replaced(rows[better], minimax.of(better))
+    wanting = (result.max_error > task.tolerance) & (result.rms < task.tolerance)
+    if bool(wanting.any()):
+        observations = views.with_rings(samples, source, task.source.image_size)
+        refined = refine_minimax(build(parameters), observations, parameters, wanting)
+        minimax = _measure(task, refined, exact)
+        better = wanting & (minimax.max_error < result.max_error) & _reaches_as_far(minimax, result)
+        result = result.replaced(better, minimax)
     return result
 
 

@@ -34,9 +34,6 @@ class Reference(NamedTuple):
         """The largest angle (C,) from the axis, up to the limit; 0 if there are no rays."""
         return torch.where(self.rays.valid, self.rays.angles, 0.0).amax(-1)
 
-    def of(self, camera: CameraLike, rows: Tensor) -> Reference:
-        return Reference(camera, self.image_size, self.lattice.of(rows), self.rays.of(rows), self.all_rays.of(rows))
-
 
 def reference(camera: CameraLike, image_size: tuple[int, int] | None, limit: float) -> Reference:
     """Return the rays of cameras (C,); rays up to `limit` radians from the axis count."""

@@ -25,9 +25,6 @@ class Lattice(NamedTuple):
     are_pixels: bool
     limit: float  # radians from the axis, beyond which rays do not count
 
-    def of(self, rows: Tensor) -> Lattice:
-        return self._replace(low=self.low[rows], high=self.high[rows])
-
     def nodes(self) -> Tensor:
         """Return the nodes (C, side^2, 2)."""
         return lattices.pixel_lattice(self.low, self.high, self.side, self.side).flatten(1, 2)
