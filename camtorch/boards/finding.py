@@ -116,17 +116,22 @@ def usable(found: Sequence[ImageCorners]) -> tuple[list[ImageCorners], list[tupl
     """Return the images that show the board at the most frequent size, and the paths of the others with the reasons."""
     sizes = Counter(one.image_size for one in found if not one.reason)
     usual = sizes.most_common(1)[0][0] if sizes else (0, 0)
-    other = "{1}x{0}, but most images are {3}x{2}"
-    used = [one for one in found if not one.reason and one.image_size == usual]
-    reasons = [(one.path, one.reason or other.format(*one.image_size, *usual)) for one in found]
-    return used, [why for one, why in zip(found, reasons, strict=True) if one.reason or one.image_size != usual]
+    used, left_out = [], []
+    for one in found:
+        if not one.reason and one.image_size == usual:
+            used.append(one)
+        else:
+            other = "{1}x{0}, but most images are {3}x{2}".format(*one.image_size, *usual)
+            left_out.append((one.path, one.reason or other))
+    return used, left_out
 
 
 def gather(words: Iterable[str]) -> list[Path]:
     """Return the paths of images, each once, in natural order, for files, folders (without subfolders) and patterns."""
     found: dict[str, Path] = {}
     for word in words:
-        if (path := Path(word)).is_dir():
+        path = Path(word)
+        if path.is_dir():
             paths = [p for p in path.iterdir() if p.suffix.lower() in IMAGES and p.is_file()]
             if not paths:
                 raise ValueError(f"{word}: the folder must hold images; got none")

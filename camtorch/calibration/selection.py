@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camtorch.calibration.calibrate import calibrate
+from camtorch.calibration.model import Model
 from camtorch.calibration.observations import Points, as_observations
 from camtorch.calibration.verdict import Calibration
 from camtorch.cameras.camera import MODELS, Camera
-from camtorch.cameras.freezing import INTRINSICS
 
 CANDIDATES: tuple[tuple[str, int], ...] = (  # models that are tried, with their numbers of coefficients
     ("pinhole", 0),
@@ -90,19 +90,22 @@ def select(
     def calibrated(rows: NDArray[Any], model: str | Camera, **options: Any) -> Calibration:
         return calibrate(model, points[rows], pixels[rows], image_size=seen.image_size, **options)
 
-    weights, tried, trials = np.isfinite(pixels[..., 0]).sum(1), list(candidates), []
+    weights = np.isfinite(pixels[..., 0]).sum(1)  # the corners of each view
+    tried, trials = list(candidates), []
     for number, (model, count) in enumerate(tried, 1):
-        names = [name for name in fixed if name in (*INTRINSICS, *(MODELS[model].names_of(count) or ()))]
+        names = [name for name in fixed if name in Model(MODELS[model], count).names]
         options = {"fixed": names, "loss": loss, "loss_scale": loss_scale}
         numbers, errors = np.arange(len(weights)), np.full(len(weights), np.nan)
         trial = Trial(model, count, math.nan, math.nan, errors)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # the numbers of a trial show what is wrong
-                if not (whole := calibrated(numbers, model, count=count, **options)).converged:
+                whole = calibrated(numbers, model, count=count, **options)
+                if not whole.converged:
                     raise ValueError("no optimum was found")
-                for fold in range(min(_FOLDS, len(numbers))):
-                    out = numbers % min(_FOLDS, len(numbers)) == fold
+                folds = min(_FOLDS, len(numbers))
+                for fold in range(folds):
+                    out = numbers % folds == fold
                     part = calibrated(np.flatnonzero(~out), whole.camera, **options)
                     posed = calibrated(np.flatnonzero(out), part.camera, fixed="all", loss=None)
                     errors[out] = np.nanmean(np.square(np.asarray(posed.residuals)).sum(-1), axis=1)
@@ -115,7 +118,8 @@ def select(
         trials.append(trial)
         if progress is not None:
             progress(number / len(tried))
-    if not (fitted := [trial for trial in trials if not trial.reason]):
+    fitted = [trial for trial in trials if not trial.reason]
+    if not fitted:
         raise ValueError(f"select: one of candidates must fit; got none. {trials[0].model}: {trials[0].reason}")
     least = min(fitted, key=lambda trial: trial.held_out)
 

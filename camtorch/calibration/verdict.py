@@ -240,7 +240,8 @@ def _of_residuals(calibration: Calibration) -> Iterator[str]:
             f"The rms of {named([calibration.views[i] for i in worse])} is up to {_px(float(rms[worse].amax()))}, and "
             f"{_px(middle)} is usual. Look at the corners, or leave such views out: they widen all uncertainties"
         )
-    if calibration.rms > rounding and (share := _pattern_share(calibration)) > _PATTERN_SHARE:
+    share = _pattern_share(calibration) if calibration.rms > rounding else 0.0
+    if share > _PATTERN_SHARE:
         yield (
             f"The residuals have a pattern over the image, of {_px(share * calibration.rms)}: the model is not that of "
             "the lens, or the board is bent. Try brown_conrady with count=8, kannala_brandt or fisheye624, or bend=True"
@@ -257,7 +258,8 @@ def _pattern_share(calibration: Calibration) -> float:
     cell = place[:, 1].clamp(max=rows - 1) * columns + place[:, 0].clamp(max=columns - 1)
     sums = residuals.new_zeros(rows * columns, 2).index_add_(0, cell, residuals)
     counts = cell.bincount(minlength=rows * columns)
-    variance, free = float(residuals.square().mean()) if len(residuals) else 0.0, 2 * int((counts > 0).sum())
+    variance = float(residuals.square().mean()) if len(residuals) else 0.0
+    free = 2 * int((counts > 0).sum())
     squares = float((sums.square().sum(-1) / counts.clamp(min=1)).sum()) / variance if variance else 0.0
     if squares - free < _CERTAIN * math.sqrt(2 * free):
         return 0.0

@@ -135,7 +135,8 @@ class Freezable(CameraLike):
         # the state shares the memory of the Parameters, which have their frozen values once they are read
         for tensor, _ in _tensors_of(self):
             getattr(self, tensor)
-        if (names := frozen_names(self)) and hasattr(destination, "_metadata"):
+        names = frozen_names(self)
+        if names and hasattr(destination, "_metadata"):
             destination._metadata[prefix[:-1]]["frozen"] = names
 
     def _load_from_state_dict(self, *arguments: Any) -> None:

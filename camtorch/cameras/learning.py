@@ -16,9 +16,11 @@ from camtorch.values.arguments import as_number
 
 def parameter_groups(camera: CameraLike, lr: float) -> list[dict[str, Any]]:
     """Return the groups of a camera, or of all that a `Mixed` is made of; see `Camera.parameter_groups`."""
-    owner, steps = f"{type(camera).__name__}.parameter_groups", dict[Tensor, float]()
-    if not 0 < (lr := as_number(lr, "lr", owner)) < math.inf:
+    owner = f"{type(camera).__name__}.parameter_groups"
+    lr = as_number(lr, "lr", owner)
+    if not 0 < lr < math.inf:
         raise ValueError(f"{owner}: lr must be a positive number of pixels; got {lr!r}")
+    steps: dict[Tensor, float] = {}
     for one in (part for part in camera.modules() if isinstance(part, CameraLike) and not part.is_mixed):
         for name in one.tensor_names:
             for tensor in _sources(one, name) if not all_frozen(one, name) else ():

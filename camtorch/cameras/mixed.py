@@ -263,12 +263,14 @@ class Mixed(Camera):
         learns = [self._member(i).intrinsics.requires_grad for i, _ in self._places]
         new = []
         for (rows, group), state in product(self.groups, (False, True)):
-            if here := [n for n, row in enumerate(rows) if learns[row] == state]:
-                part = group if len(here) == len(rows) else group[here]
-                made = part.replace(given[[rows[n] for n in here]], None, image_size)
-                if isinstance(made.intrinsics, nn.Parameter):  # made of plain numbers
-                    made.intrinsics.requires_grad_(state)
-                new.append(([rows[n] for n in here], made))
+            here = [n for n, row in enumerate(rows) if learns[row] == state]
+            if not here:
+                continue
+            part, places = group if len(here) == len(rows) else group[here], [rows[n] for n in here]
+            made = part.replace(given[places], None, image_size)
+            if isinstance(made.intrinsics, nn.Parameter):  # made of plain numbers
+                made.intrinsics.requires_grad_(state)
+            new.append((places, made))
         return type(self).of_groups(new)
 
     def __getitem__(self, index: Any) -> Camera:  # type: ignore[override]
@@ -418,12 +420,13 @@ def _joined(cls: type[Camera], function: Any, _: Any, given: Any = (), options: 
             f"{cls.__name__}: a function of cameras must be torch.stack or torch.cat; got {name}. Pass a tensor, like "
             "camera.intrinsics or camera.K"
         )
-    if other := {*given[1:], *options.values()} - {0, -1, None}:
+    other = {*given[1:], *options.values()} - {0, -1, None}
+    if other:
         raise ValueError(f"{cls.__name__}: cameras must be joined along dim 0, without out; got {shown(other.pop())}")
     for i, camera in enumerate(cameras if function is torch.stack else ()):
-        if isinstance(camera, Camera) and (shape := tuple(camera.batch_shape)):
-            joined = "torch.cat joins batches"
-            raise ValueError(f"stack: cameras[{i}] must be single; got batch dims {shape}. {joined}")
+        if isinstance(camera, Camera) and camera.batch_shape:
+            shape = tuple(camera.batch_shape)
+            raise ValueError(f"stack: cameras[{i}] must be single; got batch dims {shape}. torch.cat joins batches")
     return cat(cameras)
 
 

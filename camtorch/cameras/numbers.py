@@ -276,7 +276,8 @@ def camera_of_fov(
     degrees = as_real(fov, "fov", owner).detach().double()
     if known_false((degrees > 0) & (degrees <= 360)):
         raise ValueError(f"{owner}: fov must be in degrees, above 0 and up to 360; got {degrees.tolist()}")
-    if (known := values_of(degrees)) is not None and known.numel():
+    known = values_of(degrees)
+    if known is not None and known.numel():
         check_degrees(float(known.min()), known.tolist(), owner)
     given = () if distortion is None else (as_real(distortion, "distortion", owner, degrees.device),)
     make = cast("Callable[..., CameraT]", model)

@@ -266,11 +266,9 @@ def _some(names: Collection[str], form: str = "{!r}") -> str:
 
 def _line(name: str, camera: Camera, extrinsics: Extrinsics | None) -> str:
     size = "" if camera.image_size is None else f" {camera.image_size[1]}x{camera.image_size[0]}"
-    numbers = where = ""
-    if camera.batch_shape:
-        numbers = f" batch_shape={tuple(camera.batch_shape)}"
-    elif (values := values_of(camera.intrinsics)) is not None:
-        numbers = " ({:.7g}, {:.7g}, {:.7g}, {:.7g})".format(*values.tolist())
-    if extrinsics is not None and not extrinsics.batch_shape and (at := values_of(extrinsics.position)) is not None:
-        where = " at ({:.4g}, {:.4g}, {:.4g})".format(*(at + 0.0).tolist())
+    intrinsics = None if camera.batch_shape else values_of(camera.intrinsics)
+    numbers = "" if intrinsics is None else " ({:.7g}, {:.7g}, {:.7g}, {:.7g})".format(*intrinsics.tolist())
+    numbers = f" batch_shape={tuple(camera.batch_shape)}" if camera.batch_shape else numbers
+    position = None if extrinsics is None or extrinsics.batch_shape else values_of(extrinsics.position)
+    where = "" if position is None else " at ({:.4g}, {:.4g}, {:.4g})".format(*(position + 0.0).tolist())
     return f"  {name}: {type_before_parametrizations(camera).__name__}{size}{numbers}{where}"
