@@ -8,13 +8,12 @@ from collections.abc import Collection, Sequence
 import torch
 from torch import Tensor
 
-from camtorch.calibration.model import as_model
+from camtorch.calibration.model import Model, as_model
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import fixed_camera
 from camtorch.convert import fitting, views
 from camtorch.convert.result import Conversion
 from camtorch.models import UCM
-from camtorch.rays.lattices import angles_from_axis
 from camtorch.values.arguments import Numbers, as_image_size, as_values, hinting
 from camtorch.values.threads import on_one_thread
 
@@ -70,61 +69,18 @@ def fit(
     asked = as_model(model, count, None, fixed, owner)
     start = asked.start
     size = as_image_size(image_size, owner) or (None if start is None else start.image_size)
-    # the values (4 + n,) that parameters keep, NaN for those to find
-    height, width = size or (1, 1)
-    values = [torch.nan, torch.nan, (width - 1) / 2, (height - 1) / 2, *asked.kind.ideal(asked.count)]
-    kept = torch.tensor(values, dtype=torch.float64, device="cpu")
-    if start is not None:
-        kept = torch.cat([t.detach().double().reshape(-1).cpu() for t in start.tensors])
-    elif size is None and not bool(asked.free[2:4].all()):
-        raise ValueError(f"{owner}: image_size must be given if cx or cy is fixed; got None. Pass (height, width)")
-    kept = torch.where(asked.free, torch.nan, kept)
-    given_rays = as_values(rays, "rays", owner).detach().double()
-    given_pixels = as_values(pixels, "pixels", owner, given_rays.device).detach().double()
-    dims = given_pixels.ndim - 1
-    form = given_pixels.shape[-1:], given_rays.shape[-1:], given_rays.shape[-1 - dims : -1]
-    if dims < 1 or form != ((2,), (3,), given_pixels.shape[:-1]):
-        raise ValueError(
-            f"{owner}: pixels must be (*N, 2) and rays (*N, 3), or (*B, *N, 3); got pixels "
-            f"{tuple(given_pixels.shape)} and rays {tuple(given_rays.shape)}"
-        )
-    batch = given_rays.shape[: given_rays.ndim - 1 - dims]
-    # rows of unit rays; rays that are not finite, or have no length, get no weight
-    shape = given_rays.shape[:-1]
-    flat_rays = given_rays.reshape(math.prod(shape[:-dims]), math.prod(shape[-dims:]), 3)
-    flat_pixels = given_pixels.expand(*shape, 2).reshape(*flat_rays.shape[:2], 2)
-    lengths = torch.linalg.vector_norm(flat_rays, dim=-1, keepdim=True)
-    good = torch.isfinite(flat_rays).all(-1) & torch.isfinite(flat_pixels).all(-1) & (lengths[..., 0] > 0)
-    flat_weights = good.double()
-    if weights is not None:
-        given = as_values(weights, "weights", owner, given_rays.device).detach().to(given_rays)
-        try:
-            given = given.expand(shape).reshape(good.shape)
-        except RuntimeError:
-            wanted = f"weights must broadcast against the rays {tuple(shape)}"
-            raise ValueError(f"{owner}: {wanted}; got {tuple(given.shape)}") from None
-        if not bool(((given >= 0) & (given < math.inf)).all()):
-            raise ValueError(f"{owner}: weights must be finite, and not negative; got down to {float(given.min()):.4g}")
-        flat_weights = flat_weights * given.sqrt()  # of squares: the fit weighs errors
-    axis, good = flat_rays.new_tensor([0.0, 0.0, 1.0]), good[..., None]
-    unit = torch.where(good, flat_rays / torch.where(good, lengths, 1.0), axis)
-    seen = fitting.Observations(unit, torch.where(good, flat_pixels, 0.0), flat_weights)
-    counts = seen.weights > 0
-    if not counts.numel() or not bool((counts.sum(-1) >= _FEWEST_RAYS).all()):
-        raise ValueError(
-            f"{owner}: rays must have at least {_FEWEST_RAYS} finite rows a camera; got {counts.sum(-1).tolist()} "
-            f"of rays {tuple(given_rays.shape)}"
-        )
+    kept = _kept_values(asked, size, owner)
+    seen, batch = _as_seen(pixels, rays, weights, owner)
+    counts = seen.valid
     lens = _fit_unified(seen, owner)
     slopes = views.focal_at_axis(lens)
-    reach = torch.where(counts, angles_from_axis(seen.rays), 0.0).amax(-1)
-    names = asked.kind.names_of(asked.count) or ()
-    starts = asked.kind.fit_start(names, *views.radii(lens, slopes, reach.clamp(max=math.pi)))
+    reach = torch.where(counts, seen.angles, 0.0).amax(-1)
+    starts = asked.kind.fit_start(asked.names[4:], *views.radii(lens, slopes, reach.clamp(max=math.pi)))
     if start is not None:
         own = start.distortion.detach().to(starts).reshape(1, 1, -1).expand(1, *starts.shape[1:])
         starts = torch.cat((own, starts))
     ideal = slopes.new_tensor(asked.kind.ideal(asked.count)).expand(len(slopes), -1)
-    template = fixed_camera(asked.kind, slopes, ideal, size or (1, 1))
+    template = fixed_camera(asked.kind, slopes, ideal)
     kept = kept.to(starts)
     starts = torch.where(kept[4:].isnan(), starts, kept[4:])
     parameters = fitting.fit(template, seen, starts, slopes, fixed=kept)
@@ -135,11 +91,69 @@ def fit(
     numbers = {
         "rms": (errors.square().sum(-1) / shown.sum(-1).clamp(min=1)).sqrt(),
         "max_error": errors.amax(-1),
-        "max_angle": torch.where(shown, angles_from_axis(seen.rays), 0.0).amax(-1),
+        "max_angle": torch.where(shown, seen.angles, 0.0).amax(-1),
         "valid_fraction": shown.sum(-1) / counts.sum(-1),
         "exact": torch.zeros_like(counts[:, 0]),
     }
     return Conversion(camera, **{name: t.reshape(batch) for name, t in numbers.items()}, source_name="rays")
+
+
+def _kept_values(asked: Model, size: tuple[int, int] | None, owner: str) -> Tensor:
+    """Return the values (4 + n,) that parameters keep, NaN for those to find."""
+    if asked.start is not None:
+        values = torch.cat([t.detach().double().reshape(-1).cpu() for t in asked.start.tensors])
+    elif size is None and not bool(asked.free[2:4].all()):
+        raise ValueError(f"{owner}: image_size must be given if cx or cy is fixed; got None. Pass (height, width)")
+    else:
+        height, width = size or (1, 1)
+        middle = [torch.nan, torch.nan, (width - 1) / 2, (height - 1) / 2]
+        values = torch.tensor([*middle, *asked.kind.ideal(asked.count)], dtype=torch.float64, device="cpu")
+    return torch.where(asked.free, torch.nan, values)
+
+
+def _as_seen(
+    pixels: Numbers, rays: Numbers, weights: Numbers | None, owner: str
+) -> tuple[fitting.Observations, torch.Size]:
+    """Return rows of unit rays (C, N, 3) with their pixels and weights, and the batch dims of the cameras.
+
+    Rays that are not finite, or have no length, get no weight.
+    """
+    rays = as_values(rays, "rays", owner).detach().double()
+    pixels = as_values(pixels, "pixels", owner, rays.device).detach().double()
+    dims = pixels.ndim - 1
+    form = pixels.shape[-1:], rays.shape[-1:], rays.shape[-1 - dims : -1]
+    if dims < 1 or form != ((2,), (3,), pixels.shape[:-1]):
+        raise ValueError(
+            f"{owner}: pixels must be (*N, 2) and rays (*N, 3), or (*B, *N, 3); got pixels "
+            f"{tuple(pixels.shape)} and rays {tuple(rays.shape)}"
+        )
+    shape = rays.shape[:-1]
+    batch = shape[:-dims]
+    rows = rays.reshape(batch.numel(), math.prod(shape[-dims:]), 3)
+    places = pixels.expand(*shape, 2).reshape(*rows.shape[:2], 2)
+    lengths = torch.linalg.vector_norm(rows, dim=-1)
+    good = torch.isfinite(rows).all(-1) & torch.isfinite(places).all(-1) & (lengths > 0)
+    counted = good.double()
+    if weights is not None:
+        given = as_values(weights, "weights", owner, rays.device).detach().to(rays)
+        try:
+            given = given.expand(shape).reshape(good.shape)
+        except RuntimeError:
+            wanted = f"weights must broadcast against the rays {tuple(shape)}"
+            raise ValueError(f"{owner}: {wanted}; got {tuple(given.shape)}") from None
+        if not bool(((given >= 0) & (given < math.inf)).all()):
+            raise ValueError(f"{owner}: weights must be finite, and not negative; got down to {float(given.min()):.4g}")
+        counted = counted * given.sqrt()  # of squares: the fit weighs errors
+    axis = rows.new_tensor([0.0, 0.0, 1.0])
+    unit = torch.where(good[..., None], rows / torch.where(good, lengths, 1.0)[..., None], axis)
+    seen = fitting.Observations(unit, torch.where(good[..., None], places, 0.0), counted)
+    numbers = seen.valid.sum(-1)
+    if not seen.valid.numel() or not bool((numbers >= _FEWEST_RAYS).all()):
+        raise ValueError(
+            f"{owner}: rays must have at least {_FEWEST_RAYS} finite rows a camera; got {numbers.tolist()} "
+            f"of rays {tuple(rays.shape)}"
+        )
+    return seen, batch
 
 
 def _fit_unified(seen: fitting.Observations, owner: str) -> Camera:
@@ -164,7 +178,7 @@ def _fit_unified(seen: fitting.Observations, owner: str) -> Camera:
             "sees at these pixels. Negate y and z of OpenGL's rays (along -z, y up); pixels are (column, row)"
         )
     lens = torch.stack(lenses)[best, torch.arange(len(best), device=best.device)]
-    return fixed_camera(UCM, lens[:, :4], lens[:, 4:], (1, 1))
+    return fixed_camera(UCM, lens[:, :4], lens[:, 4:])
 
 
 def _fit_line(m: Tensor, p: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
