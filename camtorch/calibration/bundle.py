@@ -188,7 +188,8 @@ def minima(
     """Return the poses (K, 1) of least cost near the given ones, each a problem of its own, and their costs (K,)."""
     points, pixels, weights = seen.points, seen.pixels, seen.seen.to(seen.pixels)
     camera = remade(_template(model, parameters), intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
-    if (made := native_forms([camera], pixels)) is not None:
+    made = native_forms([camera], pixels)
+    if made is not None:
         search = PoseSearch(steps, SETTLED, _NOTHING, FIRST_DAMPING, loss)
         start = poses.rotations[:, 0], poses.translations[:, 0]
         rotations, translations, cost = refine_poses(made[0][0], points, pixels, weights, start, search)
@@ -351,14 +352,14 @@ class Bundle:
 
     def equations(self, flat: Sequence[Tensor], rows: Tensor) -> Equations:
         """Return the linearised problem."""
-        state, width, total = self.state(flat), self.width, len(self.columns)
-        by_camera, parts = self.all_errors(flat, rows), []
-        if (made := by_camera[0].triangles) is not None:
-            view, shared = made
+        state, by_camera = self.state(flat), self.all_errors(flat, rows)
+        if by_camera[0].triangles is not None:
+            view, shared = by_camera[0].triangles
             if self.observed[0].prior:
                 whole = torch.cat((shared, *self._rows_of_priors(state)), -2)
                 shared = torch.linalg.qr(padded(whole), mode="r").R
             return Equations(view, shared, self.columns)
+        width, total, parts = self.width, len(self.columns), []
         for c, errors in enumerate(by_camera):
             block, at = self.rows_of(c, errors, state, rows)
             if total and len(self.observed) > 1:  # a triangle has fewer rows to spread over the columns of all cameras

@@ -76,7 +76,8 @@ def start_from_nothing(observations: Observations, asked: Model, loss: Loss) -> 
         lens = _refine(lens, few, free, loss)
         one = lens.of(slice(1))
         lost, seen = int(one.lost(few).sum()), int(few.seen.sum())
-        if lost > (_LOST * seen if one.scale <= _ERRS * first.scale else 0):
+        may_lose = _LOST * seen if one.scale <= _ERRS * first.scale else 0
+        if lost > may_lose:
             raise ValueError(
                 f"calibrate: model must have pixels for all corners; got {one.model.__name__}, without {lost} of {seen}"
                 ". Use a fisheye, such as kannala_brandt"

@@ -101,7 +101,8 @@ class Rectification(GeometryModule):
 
     def _warps(self) -> tuple[Warp, Warp]:
         def make() -> tuple[Warp, Warp]:
-            (left, right), (turn, other, _) = (self.source_left, self.source_right), self._frame()
+            left, right = self.source_left, self.source_right
+            turn, other, _ = self._frame()
             return (
                 Warp(left, self.camera_left, turn.to(left.intrinsics.dtype)),
                 Warp(right, self.camera_right, other.to(right.intrinsics.dtype)),
@@ -183,7 +184,9 @@ class Rectification(GeometryModule):
         shift[self._axis, 3] = -focal * baseline
         # d = f b / z; the rows of Q are x, y, f and d / b, times a common factor
         q = torch.stack((zero + 1, fx / fy, zero, zero)).diag()
-        q[:2, 3], q[2, 3], q[3, 2] = -torch.stack((cx, cy * fx / fy)), fx, fx / focal / baseline.to(fx.dtype)
+        q[:2, 3] = -torch.stack((cx, cy * fx / fy))
+        q[2, 3] = fx
+        q[3, 2] = fx / focal / baseline.to(fx.dtype)
         return {"R1": self.rotation_left, "R2": self.rotation_right, "P1": first, "P2": first + shift, "Q": q}
 
     def extra_repr(self) -> str:
@@ -232,9 +235,12 @@ def rectify(
     left, right = as_sized(left, "left", "rectify"), as_sized(right, "right", "rectify")
     one_of(projection, tuple(_KINDS), "projection", "rectify")
     one_of(align, ("mean", "opencv"), "align", "rectify")
-    size, vertical = as_image_size(image_size, "rectify"), as_flag(vertical, "vertical", "rectify")
-    angles = [] if fov is None else list(fov) if isinstance(fov, (tuple, list)) else [fov]
-    if fov is not None and len(angles) not in (1, 2):
+    size = as_image_size(image_size, "rectify")
+    vertical = as_flag(vertical, "vertical", "rectify")
+    angles = [*fov] if isinstance(fov, (tuple, list)) else [fov]
+    if fov is None:
+        angles = []
+    elif len(angles) not in (1, 2):
         raise ValueError(f"rectify: fov must be horizontal, or (horizontal, vertical) degrees; got {fov!r}")
     check_pose("rectify", extrinsics, "right from left", left=left, right=right)
     with torch.no_grad():
@@ -276,10 +282,12 @@ def _frame(extrinsics: Extrinsics, vertical: bool, align: Align) -> tuple[Tensor
     if known_false(length > 0):
         raise ValueError(f"rectify: extrinsics.translation must not be zero; got {translation.tolist()}")
     axis, rotation = int(vertical), rotation_matrix(vector)
-    to_middle = rotation_matrix(vector / 2) if align == "opencv" else torch.eye(3).to(rotation)
+    if align == "opencv":
+        to_middle, upright = rotation_matrix(vector / 2), _unit(axis, rotation)
+    else:
+        to_middle, upright = torch.eye(3).to(rotation), rotation[..., axis, :] + _unit(axis, rotation)
     # the direction from the left camera to the right one, in the left one's frame or the middle of both
     toward = -(to_middle @ rotation.mT @ translation[..., None])[..., 0] / length[..., None]
-    upright = _unit(axis, toward) if align == "opencv" else rotation[..., axis, :] + _unit(axis, rotation)
     sign = torch.where((toward * upright).sum(-1) < 0, -1.0, 1.0).to(toward)
     along = toward * sign[..., None]
     if align == "opencv":  # the shortest turn that brings the baseline to its axis
