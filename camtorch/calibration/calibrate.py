@@ -6,7 +6,6 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -80,7 +79,7 @@ def calibrate(
     seen = as_observations(object_points, image_points, image_size, owner)
     robust, bend = as_loss(loss, loss_scale, owner), as_flag(bend, "bend", owner)
     search = Search(owner, as_model(model, count, start, fixed, owner), seen, middle_of([seen]), robust)
-    (result,) = results([search], search.alone(bend), search.free(bend)).cameras
+    (result,), _ = results([search], search.alone(bend), search.free(bend))
     if not result.converged:
         warn(f"{owner}: {result.failure} (rms {result.rms:.4g} px). Do not use the result; see its warnings")
     return result
@@ -180,18 +179,11 @@ class Search:
         return adjust(observed, others.state.of(best), free, loss=self.loss, steps=STEPS)
 
 
-class Results(NamedTuple):
-    """The results of all cameras: the optimum, each camera's calibration, rms and sigma of all corners in px."""
+def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> tuple[list[Calibration], Tensor]:
+    """Return the calibrations at an optimum, or at a better one in another basin of a model, and the noise in px.
 
-    adjusted: Adjusted
-    cameras: list[Calibration]
-    rms: float
-    sigma: float
-    noise: Tensor  # (), px, which scales the covariance; without a loss it is sigma
-
-
-def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Results:
-    """Return the results of an optimum, or of a better one in another basin of a model."""
+    The noise, a tensor (), scales all covariances; without a loss it is sigma.
+    """
     observed = [search.observed for search in searches]
     for c, search in enumerate(searches):
         adjusted = search.in_best_basin(c, observed, adjusted, free)
@@ -231,7 +223,7 @@ def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> Resul
             index=c,
         )
         cameras.append(camera)
-    return Results(adjusted, cameras, rms_of(residuals, seen), float(sigma), noise)
+    return cameras, noise
 
 
 def extrinsics_of(boards: Poses, middle: Tensor) -> Extrinsics:

@@ -42,11 +42,6 @@ class Solved(NamedTuple):
     covariance: Tensor
 
 
-def can_search(*tensors: Tensor) -> bool:
-    """Whether native code can search for poses of these tensors."""
-    return library() is not None and all(t.is_cpu for t in tensors)
-
-
 def from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return rotations (B, 2, 3, 3), translations and valid as `poses_from_rays` does; row b sees points[b % P]."""
     count, call = len(rays), structs.Poses(task=structs.FROM_RAYS)

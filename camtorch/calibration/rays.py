@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch.calibration.native_calls import can_search, from_rays
+from camtorch.calibration.native_calls import from_rays
+from camtorch.native.library import library
 from camtorch.poses.rotations import nearest_rotation, small_turn
 
 _PAIRS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # where a symmetric matrix's entries are among its six numbers
@@ -42,7 +43,7 @@ def poses_from_rays(points: Tensor, rays: Tensor, weights: Tensor) -> RayPoses:
     finite, four points or more are seen, not all on a line, and most lie ahead on their rays; the second pose must also
     be another minimum. Invalid poses are finite and have no meaning.
     """
-    if can_search(points, rays, weights):
+    if library() is not None and points.is_cpu and rays.is_cpu and weights.is_cpu:
         return RayPoses(*from_rays(points, rays, weights))
     # points that are not finite, which a sum shows, get weight 0; points without weight are zero
     seen = torch.isfinite(points.sum(-1) + rays.sum(-1) + weights) & (weights > 0)

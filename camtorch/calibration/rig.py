@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from camtorch.calibration.bundle import Bundle, CameraObservations, Free, Poses, State, adjust
-from camtorch.calibration.calibrate import STEPS, Search, extrinsics_of, middle_of, results
+from camtorch.calibration.calibrate import STEPS, Search, extrinsics_of, middle_of, results, rms_of
 from camtorch.calibration.model import as_model
 from camtorch.calibration.observations import Points, as_rig_observations
 from camtorch.calibration.robust import Loss, as_loss
@@ -139,18 +139,18 @@ def calibrate_rig(
             unknown = ", ".join(map(repr, stray))
             raise ValueError(f"{owner}: names must be those of cameras, {', '.join(by_name)}; got {unknown}")
     middle, searches = middle_of([*by_name.values()]), []
-    for name, seen in by_name.items():
+    for name, observations in by_name.items():
         of = f"{owner}: {name}"
         asked = as_model(models[name], _own(count, name, None), _own(start, name, None), _own(fixed, name, ()), of)
-        searches.append(Search(of, asked, seen, middle, robust))
+        searches.append(Search(of, asked, observations, middle, robust))
     observed = [search.observed for search in searches]
     learns = tuple(parameters for search in searches for parameters in search.free().parameters)
     free = Free(learns, mounts=True, bend=bend)
     adjusted = adjust(observed, _join_starts(searches, observed, free), free, loss=robust, steps=STEPS)
-    found = results(searches, adjusted, free)
-    cameras, state = dict(zip(by_name, found.cameras, strict=True)), found.adjusted.state
-    equations = found.adjusted.equations
-    std = torch.linalg.vector_norm(shared_factor(equations)[0] * found.noise, dim=-1)
+    found, noise = results(searches, adjusted, free)
+    adjusted = found[0].adjusted  # of all cameras
+    state, equations = adjusted.state, adjusted.equations
+    std = torch.linalg.vector_norm(shared_factor(equations)[0] * noise, dim=-1)
     mounts, mount_std = {}, {}
     for c, (name, rotation, shift) in enumerate(zip(by_name, *(t[0] for t in state.mounts), strict=True)):
         mounts[name], mount_std[name] = Extrinsics(rotation_vector(rotation).unsqueeze(-1), shift), std.new_zeros(6)
@@ -158,16 +158,18 @@ def calibrate_rig(
         places, _ = places_of(equations.columns, c, range(first, first + 6))
         if places:
             mount_std[name] = std[places]
+    cameras = dict(zip(by_name, found, strict=True))
+    residuals, seen = torch.cat([r[0] for r in adjusted.residuals]), torch.cat([one.seen for one in by_name.values()])
     result = RigCalibration(
         rig=Rig({name: c.camera for name, c in cameras.items()}, mounts),
         boards=extrinsics_of(state.boards, middle),
-        rms=found.rms,
-        sigma=found.sigma,
+        rms=rms_of(residuals, seen),
+        sigma=found[0].sigma,
         cameras=cameras,
         mount_std=mount_std,
-        converged=all(c.converged for c in found.cameras),
-        bend=found.cameras[0].bend,
-        views=found.cameras[0].views,
+        converged=all(c.converged for c in found),
+        bend=found[0].bend,
+        views=found[0].views,
     )
     if not result.converged:
         warn(
