@@ -217,9 +217,9 @@ FEW_REAL = slow_unless(lambda case: case[0] in DISTINCT and case[1] == next(iter
 
 def spread(key, dtype=torch.float64):
     """A camera with every coefficient away from zero, so that no term of the formula can be forgotten."""
-    count = len(one(key).distortion_names)
-    sign = torch.tensor([1.0, -1.0]).repeat(count)[:count]
-    limits = torch.tensor([limits_of(key, name, wild=False) for name in one(key).distortion_names]).view(-1, 2)
+    names = one(key).distortion_names
+    sign = torch.tensor([1.0, -1.0]).repeat(len(names))[: len(names)]
+    limits = torch.tensor([limits_of(key, name, wild=False) for name in names]).view(-1, 2)
     middle, half = limits.mean(-1), (limits[:, 1] - limits[:, 0]) / 2
     distortion = nodes_of_steps(key, middle + 0.3 * sign * half)
     slope = axis_slope(key, distortion.tolist())
