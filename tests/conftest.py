@@ -28,6 +28,7 @@ def pytest_collection(session):
         import torch._decomp.decompositions_for_jvp
     if not torch.accelerator.is_available():  # torch's own keeps a traceback for each kind of device: a millisecond
         torch.manual_seed = torch.default_generator.manual_seed
+    os.fsync = lambda file: None  # a hundredth of a second for each file, of which none must outlive a loss of power
     # xdist has a process on every core already
     torch.set_num_threads(1)
     # the same examples on every machine and in every run; speed is not what these tests are about
