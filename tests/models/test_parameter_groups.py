@@ -19,7 +19,7 @@ QUICK = {("kannala_brandt", "AdamW"), ("brown_conrady", "momentum")}.__contains_
 
 
 def pixels_moved_at_most(camera, lr, count=None):
-    rays, seen = camera.unproject(pixel_lattice(camera))
+    rays, seen = camera.unproject(pixel_lattice(camera, 13, 17))
     steps = lr * torch.eye(len(camera.distortion), dtype=torch.float64)[:count]
     after, valid = camera.replace(distortion=camera.distortion + steps).project(rays.expand(len(steps), -1, 3))
     return (after - camera.project(rays)[0]).norm(dim=-1)[valid & seen].max().item()
