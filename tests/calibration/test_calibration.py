@@ -175,12 +175,11 @@ def test_what_is_held_or_frozen_at_its_best_value_changes_no_other(left):
 @pytest.mark.parametrize("loss", [pytest.param("huber", marks=slow), "cauchy"])
 def test_gross_outliers(loss, left):
     """One corner in ten is 5 to 60 px off."""
-    generator = torch.Generator().manual_seed(4)
     wrong = torch.zeros(13 * 54, dtype=torch.bool)
-    wrong[torch.randperm(13 * 54, generator=generator)[:70]] = True
+    wrong[torch.randperm(13 * 54)[:70]] = True
     wrong = wrong.view(13, 54)
-    angle = 2 * math.pi * torch.rand(13, 54, generator=generator)
-    length = 5 + 55 * torch.rand(13, 54, generator=generator)
+    angle = 2 * math.pi * torch.rand(13, 54)
+    length = 5 + 55 * torch.rand(13, 54)
     pixels = LEFT.image_points + (wrong * length)[..., None] * torch.stack((angle.cos(), angle.sin()), -1)
     found = calibrate(LEFT._replace(image_points=pixels), loss=loss, loss_scale=0.3)
     assert bool(((values(found) - values(left)).abs() < 3 * left.std).all())

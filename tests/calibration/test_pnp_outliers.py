@@ -120,9 +120,8 @@ def test_what_does_not_agree_is_invalid():
 
 def test_many_points_without_a_pose_come_to_an_end():
     camera = ct.Pinhole.from_fov(60, image_size=(480, 640)).double().requires_grad_(False)
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(300, 3, generator=generator, dtype=torch.float64)
-    pixels = 400 * torch.rand(300, 2, generator=generator, dtype=torch.float64)
+    points = torch.rand(300, 3, dtype=torch.float64)
+    pixels = 400 * torch.rand(300, 2, dtype=torch.float64)
     pose = ct.solve_pnp(camera, points, pixels, threshold=0.5)
     assert torch.isfinite(pose.extrinsics.translation).all()
     assert pose.inliers.sum() < 30
@@ -150,9 +149,8 @@ def test_a_pose_is_three_with_two_beside():
 def test_covariance_is_that_of_refits(far):
     camera, target, _, _, exact = problems(130, 1, 12, 0.0)
     target = target + far
-    g = torch.Generator().manual_seed(1)
     truth = ct.solve_pnp(camera, target, exact).extrinsics.matrix()[0]
-    seen = exact + NOISE * torch.randn(2000, 12, 2, generator=g).double()
+    seen = exact + NOISE * torch.randn(2000, 12, 2).double()
     pose = ct.solve_pnp(camera, target, seen)
     found = pose.extrinsics.matrix()
     w = ct.Extrinsics.from_matrix(found[:, :3, :3] @ truth[:3, :3].mT, torch.zeros(2000, 3).double()).rotation

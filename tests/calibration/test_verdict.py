@@ -101,8 +101,7 @@ def test_what_the_data_do_not_carry(what):
 @pytest.mark.slow
 def test_outliers_and_bad_views():
     board, pixels = views(NARROW, *all_over(10))
-    generator = torch.Generator().manual_seed(1)
-    pixels[3, 10:20] += 20 * torch.rand(10, 2, generator=generator, **F64)
+    pixels[3, 10:20] += 20 * torch.rand(10, 2, **F64)
     pixels[7, 5] += 30
     result = found("brown_conrady", (board, pixels))
     one(result.warnings, 'corners are outliers.* of them in view 3.*loss="cauchy" keeps them')

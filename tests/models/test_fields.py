@@ -209,8 +209,7 @@ def distance(points, curve):
 def test_the_curve_is_near_with_short_pieces_and_ends_where_the_lens_does(key):
     camera = one(key).requires_grad_(False)
     camera = camera.resize(camera.height * 640 // camera.width, 640)
-    generator = torch.Generator().manual_seed(3)
-    points = torch.randn(4, 3, generator=generator, dtype=torch.float64)
+    points = torch.randn(4, 3, dtype=torch.float64)
     points[::2, 2] = points[::2, 2].abs()  # some in front, and some edges that go behind
     curves = camera.project_polyline(points)
     assert curves

@@ -155,8 +155,7 @@ def test_a_surface_goes_behind_any_lens_at_any_place():
         def names_of(cls, count):
             return tuple(f"c{i}" for i in range(count)) if count == 62 else None
 
-    generator = torch.Generator().manual_seed(1)
-    k = 0.02 * torch.randn(62, generator=generator, dtype=torch.float64)
+    k = 0.02 * torch.randn(62, dtype=torch.float64)
     camera = Bent(torch.tensor([300.0, 300, 320, 240], dtype=torch.float64), k, image_size=(480, 640))
     pixels = camera.pixel_grid(32).double().reshape(-1, 2)
     rays, valid = camera.unproject(pixels)

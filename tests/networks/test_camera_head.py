@@ -144,9 +144,8 @@ def test_one_moves_the_rim_by_a_tenth():
 @pytest.mark.parametrize("key", slow_unless(DISTINCT.__contains__, sorted(USUAL - PANORAMAS - OTHERS - {"pinhole"})))
 def test_gradients_are_those_of_what_it_computes(key):
     layer = head(key, shared_focal=False).double()
-    generator = torch.Generator().manual_seed(2)
-    numbers = torch.randn(2, len(layer.names), generator=generator, dtype=torch.float64)
-    step = 1e-5 * torch.randn(numbers.shape, generator=generator, dtype=torch.float64)
+    numbers = torch.randn(2, len(layer.names), dtype=torch.float64)
+    step = 1e-5 * torch.randn(numbers.shape, dtype=torch.float64)
 
     def outputs(x):
         camera = layer.camera(x)

@@ -237,14 +237,13 @@ def test_a_mixed_batch_and_a_panorama_learn_as_exact_ones():
 
 @pytest.mark.parametrize(("most", "some"), [(CELL_CUBIC, CELL_QUINTIC), (CELL_QUINTIC, CELL_CUBIC)])
 def test_pixels_of_a_lattice_and_their_transpose_are_those_of_torch(most, some):
-    generator = torch.Generator().manual_seed(0)
     for size in ((16, 24), (77, 601)):
         n, m = (-(-side // 8) for side in size)
-        nodes, cells = torch.randn(2, 2, n + 5, m + 5, generator=generator), torch.full((2, n, m), most).int()
+        nodes, cells = torch.randn(2, 2, n + 5, m + 5), torch.full((2, n, m), most).int()
         cells[0, 0, 1], cells[0, 1, 0], cells[1, -1, -1], cells[:, -1, 0] = CELL_EMPTY, 0, 1, some
-        exact = torch.randn(2, 2, 8, 8, generator=generator)
+        exact = torch.randn(2, 2, 8, 8)
         exact[:, 0, :3] = torch.nan
-        cotangent, found = torch.randn(2, *size, 2, generator=generator), []
+        cotangent, found = torch.randn(2, *size, 2), []
         for dtype in (torch.float32, torch.float64):
             leaves = nodes.to(dtype).requires_grad_(), exact.to(dtype).requires_grad_()
             where = Lattice(leaves[0], cells, leaves[1], size).pixels
