@@ -12,7 +12,7 @@ from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import known_false, known_true
-from camtorch.values.arguments import Numbers, as_batch, as_number, as_real, is_list
+from camtorch.values.arguments import Numbers, as_batch, as_coordinates, as_number, as_real, is_list
 
 
 class OddPolynomial(Camera):
@@ -78,31 +78,30 @@ class FreePolynomial(Camera):
             ValueError: If there are fewer than two coefficients, the first one or c is not positive, c <= d e (no
                 camera), or the model has no d and e.
         """
-        aspect_ratio = as_number(aspect_ratio, "aspect_ratio", cls.__name__)
-        centre = as_real(centre, "centre", cls.__name__)
-        coefficients = as_real(coefficients, "coefficients", cls.__name__, centre.device)
-        if centre.ndim == 0 or centre.shape[-1] != 2:
-            raise ValueError(f"{cls.__name__}: centre must be (*B, 2) = cx, cy; got shape {tuple(centre.shape)}")
+        owner = cls.__name__
+        aspect_ratio = as_number(aspect_ratio, "aspect_ratio", owner)
+        centre = as_real(centre, "centre", owner)
+        coefficients = as_real(coefficients, "coefficients", owner, centre.device)
+        as_coordinates(centre, "centre", 2, owner, form="*B", means=" = cx, cy")
         if coefficients.ndim == 0 or coefficients.shape[-1] < 2:
-            raise ValueError(f"{cls.__name__}: coefficients must be (*B, n), n >= 2; got {tuple(coefficients.shape)}")
+            raise ValueError(f"{owner}: coefficients must be (*B, n), n >= 2; got {tuple(coefficients.shape)}")
         first = coefficients[..., :1]
         if known_false(first > 0):
             raise ValueError(
-                f"{cls.__name__}: the first coefficient, of the first power, must be positive; got {first.tolist()}. "
+                f"{owner}: the first coefficient, of the first power, must be positive; got {first.tolist()}. "
                 "Leave out a zero constant before it"
             )
-        linear = as_real(linear_cde, "linear_cde", cls.__name__, centre.device)
-        if linear.ndim == 0 or linear.shape[-1] != 3:
-            raise ValueError(f"{cls.__name__}: linear_cde must be (*B, 3) = c, d, e; got shape {tuple(linear.shape)}")
+        linear = as_real(linear_cde, "linear_cde", owner, centre.device)
+        as_coordinates(linear, "linear_cde", 3, owner, form="*B", means=" = c, d, e")
         if is_list(linear_cde):  # in the precision of the coefficients
             linear = torch.tensor(linear_cde, dtype=coefficients.dtype, device=coefficients.device)
         c, d, e = linear.split(1, -1)
         if known_false((c > 0) & (c > d * e)):
             raise ValueError(
-                f"{cls.__name__}: linear_cde = c, d, e must have c > 0 and c > d e; got {linear.tolist()}. In files "
+                f"{owner}: linear_cde = c, d, e must have c > 0 and c > d e; got {linear.tolist()}. In files "
                 "zeros mean 1, 0, 0"
             )
-        batch = as_batch(cls.__name__, centre=centre.shape, coefficients=coefficients.shape, linear_cde=linear.shape)
+        batch = as_batch(owner, centre=centre.shape, coefficients=coefficients.shape, linear_cde=linear.shape)
         is_straight = linear_cde == (1.0, 0.0, 0.0) if isinstance(linear_cde, tuple) else False
         is_straight = is_straight or (not linear.requires_grad and known_true(linear[..., 1:] == 0))
         focal, distortion = cls._scaled(coefficients)
@@ -110,7 +109,7 @@ class FreePolynomial(Camera):
         intrinsics = torch.cat(torch.broadcast_tensors(focal, centre), -1)
         kind: type[FreePolynomial] | None = cls if cls.shear_names or is_straight else cls.sheared
         if kind is None:
-            raise ValueError(f"{cls.__name__}: d and e must be 0; got {linear.tolist()}. Use FTheta, which has them")
+            raise ValueError(f"{owner}: d and e must be 0; got {linear.tolist()}. Use FTheta, which has them")
         if kind.shear_names:
             shear = torch.cat((e, d / c), -1)
             distortion = torch.cat([w.to(focal).expand(*batch, w.shape[-1]) for w in (shear, distortion)], -1)

@@ -9,7 +9,7 @@ from typing_extensions import Self
 from camtorch.evaluate.tensors import known_false
 from camtorch.models._polynomial import OddPolynomial
 from camtorch.optics import Chart, Equidistant, Lens, Planar, Polynomial
-from camtorch.values.arguments import Numbers, as_batch, as_real
+from camtorch.values.arguments import Numbers, as_batch, as_coordinates, as_real
 
 
 class KannalaBrandt(OddPolynomial):
@@ -51,8 +51,7 @@ class KannalaBrandt(OddPolynomial):
         """
         intrinsics = as_real(intrinsics, "intrinsics", cls.__name__)
         coefficients = as_real(coefficients, "coefficients", cls.__name__, intrinsics.device)
-        if intrinsics.ndim == 0 or intrinsics.shape[-1] != 4:
-            raise ValueError(f"{cls.__name__}: intrinsics must be (*B, 4); got shape {tuple(intrinsics.shape)}")
+        as_coordinates(intrinsics, "intrinsics", 4, cls.__name__, form="*B")
         if coefficients.ndim == 0 or coefficients.shape[-1] == 0:
             raise ValueError(f"{cls.__name__}: coefficients must be (*B, n), n >= 1; got {tuple(coefficients.shape)}")
         first = coefficients[..., :1]
