@@ -9,7 +9,7 @@ The module is imported by name: `import camtorch.augment.numpy`.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +35,7 @@ class Way(NamedTuple):
 
     read: Callable[[Any], Sample]  # value -> tensors by name
     write: Callable[[Sample, Any], Any]  # (moved sample, value as given) -> value
+    names: Set[str]  # of the tensors
 
 
 class Transform(FrontEnd):
@@ -119,24 +120,16 @@ class Transform(FrontEnd):
         camera = sample.get("camera")
         if camera is None and otherwise is not None:
             camera = sample["camera"] = otherwise
-        size = getattr(self.augmentation.camera if camera is None else camera, "image_size", None)
-        form = _form_of(sample)
-        if form is None:
-            ways = self._ways(sample, size)
-        else:
-            settings = {**self.augmentation.fields}, self.augmentation.mirroring
-            ways = self._forms((), (form, size, *settings), lambda: self._ways(sample, size))
-        read = {name: way.read(sample[name]) for name, way in ways.items()}
+        ways = self._ways(sample, camera)
         tensors = Single()
-        for of_field in read.values():
-            tensors.update(of_field)
+        for name, way in ways.items():
+            tensors.update(way.read(sample[name]))
 
         def write(moved: Sample) -> Sample:
-            result = {
-                name: way.write(moved, sample[name])
-                for name, way in ways.items()
-                if read[name].keys() <= moved.keys()  # a face is moved back without its rotation
-            }
+            result = {}
+            for name, way in ways.items():
+                if moved.keys() >= way.names:  # a face is moved back without its rotation
+                    result[name] = way.write(moved, sample[name])
             for name, value in moved.items():
                 if name not in tensors or name == PLACE:
                     value = plain(value) if isinstance(value, Tensor) else value
@@ -154,9 +147,22 @@ class Transform(FrontEnd):
             kind = kind if kind not in IMAGES or np.ndim(value) > 1 else None  # a flag for each sample
         return kind
 
-    def _ways(self, sample: Mapping[str, Any], size: tuple[int, int] | None) -> dict[str, Way]:
+    def _ways(self, sample: Sample, camera: Any) -> dict[str, Way]:
+        """Return the way of each field, which are kept by the form of the sample."""
+        form, own = _form_of(sample), self.augmentation
+        if form is None:
+            return self._new_ways(sample, camera)
+        key = form, own.mirroring, *own.fields.items()
+        known = self._forms.entry((), key)
+        if known is None:
+            return self._forms((), key, lambda: self._new_ways(sample, camera))
+        ways: dict[str, Way] = known.result
+        return ways
+
+    def _new_ways(self, sample: Sample, camera: Any) -> dict[str, Way]:
         """Return the way of each field, which its form alone decides: of images, of one, of numbers, or of all else."""
         ways, mirroring = dict[str, Way](), self.augmentation.mirroring
+        size = getattr(self.augmentation.camera if camera is None else camera, "image_size", None)
         for name, value in sample.items():
             kind = None if name in OWN or value is None else self._kind(name, value, sample)
             if kind in IMAGES and (name in ALIASES or isinstance(value, (list, tuple))):
@@ -171,13 +177,13 @@ class Transform(FrontEnd):
 
 
 def _way_of_others(name: str) -> Way:
-    return Way(lambda given: {name: given}, lambda moved, given: moved[name])
+    return Way(lambda given: {name: given}, lambda moved, given: moved[name], {name})
 
 
 def _way_of_numbers(name: str, value: Any, kind: str | None) -> Way:
     """Return the way of labels, of flags, and of orders of landmarks, whose kind is None."""
     if kind is not None and _is_shared(name, value) and value.dtype.kind == "f":
-        return Way(lambda given: {name: torch.from_numpy(given)}, lambda moved, given: moved[name].numpy())
+        return Way(lambda given: {name: torch.from_numpy(given)}, lambda moved, given: moved[name].numpy(), {name})
 
     def read(given: Any) -> Sample:
         return {name: as_tensor(_numbers(given, name, kind), name, _OWNER)}
@@ -185,7 +191,7 @@ def _way_of_numbers(name: str, value: Any, kind: str | None) -> Way:
     def write(moved: Sample, given: Any) -> Any:
         return plain(moved[name]).astype(_numbers(given, name, kind).dtype, copy=False)
 
-    return Way(read, write)
+    return Way(read, write, {name})
 
 
 def _way_of_image(name: str, value: Any, size: tuple[int, int] | None) -> Way:
@@ -200,10 +206,12 @@ def _way_of_image(name: str, value: Any, size: tuple[int, int] | None) -> Way:
 
     read(value)  # raises if it is none
     if not _is_shared(name, value):
-        return Way(read, write)
+        return Way(read, write, {name})
     if value.ndim == 2:
-        return Way(lambda given: {name: torch.from_numpy(given)[None]}, lambda moved, given: moved[name].numpy()[0])
-    return Way(lambda given: {name: torch.from_numpy(given).permute(2, 0, 1)}, write)
+        return Way(
+            lambda given: {name: torch.from_numpy(given)[None]}, lambda moved, given: moved[name].numpy()[0], {name}
+        )
+    return Way(lambda given: {name: torch.from_numpy(given).permute(2, 0, 1)}, write, {name})
 
 
 def _way_of_images(name: str, value: Any, size: tuple[int, int] | None, kind: str | None) -> Way:
@@ -213,6 +221,7 @@ def _way_of_images(name: str, value: Any, size: tuple[int, int] | None, kind: st
         return Way(
             lambda given: {key: torch.from_numpy(given.reshape(given.shape[:3]))},
             lambda moved, given: np.empty((*moved[key].shape, *given.shape[3:]), given.dtype),
+            {key},
         )
 
     def read(given: Any) -> Sample:
@@ -222,7 +231,7 @@ def _way_of_images(name: str, value: Any, size: tuple[int, int] | None, kind: st
         images = [as_array(moved[f"{key}[{i}]"], one) for i, one in enumerate(given)]
         return images if is_list else np.stack(images)
 
-    return Way(read, write)
+    return Way(read, write, {f"{key}[{i}]" for i in range(len(value))})
 
 
 def _is_shared(name: str, value: Any) -> bool:
