@@ -226,7 +226,7 @@ class Augmentation(SampleTransform):
                 f"got image_size={self.image_size} for images of {camera.image_size}"
             )
         applied, count = draw["apply"], len(draw["apply"])
-        chosen = which_apply(applied)
+        chosen = applied if isinstance(applied, list) else which_apply(applied)
         if chosen is not None and not all(chosen):
             return self._change_of_some(camera, draw, chosen)
         # if values may not be read, all rows are moved, and `gate` later keeps those that were not drawn
@@ -258,9 +258,7 @@ class Augmentation(SampleTransform):
 
     def _checked_draw(self, draw: Mapping[str, Tensor]) -> Draw:
         """Return a draw that was given as arrays, or as tensors if numbers may not be read."""
-        sizes: dict[str, int | None] = {name: interval.size for name, interval in self.ranges.items()}
-        sizes |= dict.fromkeys(self.crops, 4)
-        return checked_draw(draw, sizes, self._name)
+        return checked_draw(draw, self.ranges, self.crops, self._name)
 
     def _part(self, source: Camera, draw: Draw) -> Part:
         return self._part_by_torch(source, values_for(source, draw))

@@ -29,7 +29,7 @@ from camtorch.warp.warp import Warp
 
 _NO_TURN = np.eye(3)
 _HALF = 5e-3  # absolute: rotations that were half precision on the way are the same ones
-_ROUNDED = 1e-5  # relative: cameras that were float32 on the way are the same ones
+_ROUNDED, _ABSOLUTE = 1e-5, 1e-8  # relative and absolute: cameras that were float32 on the way are the same ones
 TensorOrPair = TypeVar("TensorOrPair", Tensor, tuple[Tensor, Tensor])
 
 
@@ -83,12 +83,6 @@ class LazyWarp:
         intrinsics, distortion = torch.from_numpy(numbers.copy()).as_subclass(nn.Parameter), torch.from_numpy(k.copy())
         distortion = distortion.as_subclass(nn.Parameter) if k.shape[-1] else distortion
         return remade(self.like, intrinsics=intrinsics, distortion=distortion, image_size=self.image_size)
-
-    def new_rotation(self) -> Tensor:
-        """Return the rotation (3, 3) of one, in memory of its own; numpy copies it in less time than torch."""
-        if self.rotation is None:
-            return torch.from_numpy(_NO_TURN.astype(self.intrinsics.dtype))
-        return torch.from_numpy(self.rotation.numpy().copy())
 
     def transform_positions(self, points: Tensor) -> Tensor:
         """Return points (B, *N, 3) of the source's frame in the target's."""
@@ -178,7 +172,8 @@ class Part:
                 "Compose: chromatic and vignetting must be those of the last lens of a chain; got an earlier one, "
                 "whose colours or light would be seen through another lens"
             )
-        if isinstance(last, LazyWarp) and not self.camera.batch_shape:
+        are_known = rotation is None or are_numbers(rotation)  # else the rotation may learn
+        if isinstance(last, LazyWarp) and are_known and not self.camera.batch_shape:
             native = first.source_native if isinstance(first, LazyWarp) else _single(self.camera)
             may_mirror = rotation is not None and (rotation.ndim > 2 or not is_right(rotation))
             moves = replace(last, rotation=rotation, source_native=native, may_mirror=may_mirror)
@@ -310,7 +305,9 @@ class Change:
         if batched or self.gate is not None or (rotation is not None and rotation.ndim > 2):
             return (self.rotation if batched else self.rotation[0]).clone()
         if isinstance(moves, LazyWarp):
-            return moves.new_rotation()
+            if rotation is None:
+                return torch.from_numpy(_NO_TURN.astype(moves.intrinsics.dtype))
+            return torch.from_numpy(rotation.numpy().copy())  # in less time than a clone
         return _eye(self.parts[0].camera.intrinsics) if rotation is None else rotation.clone()
 
     several: Camera = _renamed("several", "camera_for_sample", batched=True)
@@ -344,8 +341,15 @@ class Change:
 
     def leads_to(self, camera: Camera | Sequence[Camera], rotation: Tensor | None = None) -> bool:
         """Whether this change may end with `camera` and `rotation`: False if their values are known to differ."""
-        pairs = [(self.target.intrinsics.reshape(-1, 4), one_or_batch(camera).intrinsics.reshape(-1, 4), 1e-8)]
-        pairs += [] if rotation is None else [(self.rotation, rotation.reshape(-1, 3, 3), _HALF)]
+        target, given = self.target, one_or_batch(camera)
+        pairs = [(target.intrinsics.reshape(-1, 4), given.intrinsics.reshape(-1, 4), _ABSOLUTE)]
+        if rotation is not None:
+            pairs.append((self.rotation, rotation.reshape(-1, 3, 3), _HALF))
+        if not target.is_mixed and not given.is_mixed:
+            pairs.append((_coefficients(target), _coefficients(given), _ABSOLUTE))
+        elif len(pairs[0][0]) == len(pairs[0][1]):
+            cameras = zip(target, given if given.batch_shape else [given], strict=True)
+            pairs += [(_coefficients(ours), _coefficients(its), _ABSOLUTE) for ours, its in cameras]
         return all(
             ours.shape == its.shape
             and not known_false(torch.isclose(ours.double(), its.to(ours.device).double(), _ROUNDED, near))
@@ -576,6 +580,12 @@ def one_or_batch(camera: Camera | Sequence[Camera]) -> Camera:
     """Return the one camera of all samples, or the batch of theirs; a list becomes a batch."""
     camera = camera if isinstance(camera, Camera) else Mixed(camera)
     return camera[0] if camera.batch_shape == (1,) else camera
+
+
+def _coefficients(camera: Camera) -> Tensor:
+    """Return the coefficients (N, n) of cameras of one model."""
+    batch, count = camera.batch_shape, camera.distortion.shape[-1]
+    return camera.distortion.expand(*batch, count).reshape(batch.numel(), count)
 
 
 def _eye(like: Tensor) -> Tensor:

@@ -115,8 +115,10 @@ class CameraDrawer(Augmentation):
             values["place"] = 0, 1
         self.ranges: dict[str, Range] = {}
         for name, limit in _LIMITS.items():
-            if (value := values.get(name)) is not None:
-                value = (value, value) if name in _EXACT and isinstance(value, (int, float)) else value
+            value = values.get(name)
+            if name in _EXACT and isinstance(value, (int, float)):
+                value = value, value
+            if value is not None:
                 self.ranges[name] = as_range(value, name, self._name, **limit)
         if "fov" in self.ranges:
             check_degrees(self.ranges["fov"].low, fov, self._name)
@@ -162,8 +164,7 @@ class CameraDrawer(Augmentation):
         start = None if isinstance(draw["apply"], Tensor) else self._start(source, values)
         if start is None:
             return self._part_by_torch(source, values)
-        has_own_lens = self._is_real or self.like is not None
-        made = start.warp(values, start.base if has_own_lens else source, self._warp_options)
+        made = start.warp(source, values, self._warp_options)
         if self.min_filled and (min(made.filled, default=1) < self.min_filled or max(made.zooms, default=1) > 1):
             self._tell_of(source, lambda: made.target, torch.tensor([*made.zooms]), torch.tensor([*made.filled]))
         options = self.options
@@ -177,8 +178,11 @@ class CameraDrawer(Augmentation):
 
         None if a camera learns, or native code lacks a range or a model.
         """
-        like = self._like_for(source)
-        tensors = source.tensors if like is None else source.tensors + like.tensors
+        like = self._modules.get("like")  # found in less time than by the attribute
+        tensors: tuple[Tensor, ...] = (source.intrinsics, source.distortion)
+        if like is not None:
+            like = self._like_for(source)
+            tensors += like.tensors
         if not hold_numbers(tensors):
             return None
         if self._is_real:  # each draw has a lens of its own
@@ -196,7 +200,8 @@ class CameraDrawer(Augmentation):
         if not self._keeps_formulas:
             return None
         names = values.keys() - self.beside_the_camera - {"lens"}
-        base, sized, covered_radius = self._lens_for(source.detach().clone(), values.get("lens"))
+        source = source.detach().clone()
+        base, sized, covered_radius = self._lens_for(source, values.get("lens"))
         size, nominal = self._size_of(source), None
         if "distortion" in values and base.distortion.shape[-1] > 0:
             nominal = self._nominal(base, sized, size, values)
@@ -205,8 +210,9 @@ class CameraDrawer(Augmentation):
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         if not self._keeps_formulas:
             return super()._new_camera(source, values)
-        for name, one in self.ranges.items():  # which may have been set since
-            if name in _LIMITS and one.size != (size := _LIMITS[name].get("size")):
+        for name, limit in _LIMITS.items():
+            size, one = limit.get("size"), self.ranges.get(name)  # which may have been set since
+            if one is not None and one.size != size:
                 wanted = "Range(low, high)" if size is None else f"Range(low, high, {size})"
                 raise ValueError(f"{self._name}: the range {name!r} must be {wanted}; got {one!r}")
         example = precise(source.intrinsics.detach())
@@ -240,7 +246,8 @@ class CameraDrawer(Augmentation):
             fx, fy, cx, cy = fx / share, fy / share, (cx + 0.5 - left) / share - 0.5, (cy + 0.5 - top) / share - 0.5
         intrinsics = _joined((fx, fy, cx, cy), distortion)
         target = remade(base, intrinsics=intrinsics, distortion=distortion, image_size=size)
-        if not (turns := [values[name] for name in _TURNS if name in values]):
+        turns = [values[name] for name in _TURNS if name in values]
+        if not turns:
             return target, None
         none = 0 * turns[0]
         angles = [torch.deg2rad(values.get(name, none)) for name in _TURNS]
@@ -288,12 +295,10 @@ class CameraDrawer(Augmentation):
 
         return self._memo(base.tensors, ("nominal", type(base), base.image_size, size, self.ranges["fov"]), made)
 
-    def _like_for(self, source: Camera) -> Camera | None:
+    def _like_for(self, source: Camera) -> Any:
         """Return `like`, on the CPU if the source is there and its numbers are known; None without `like`."""
-        like: Any = self._modules.get("like")  # found in less time than by the attribute
-        if like is None or like.intrinsics.is_cpu or not source.intrinsics.is_cpu:
-            return like  # type: ignore[no-any-return]
-        return twin_of(like) or like
+        like = self.like
+        return like if like is None or not source.intrinsics.is_cpu else twin_of(like) or like
 
     def _size_of(self, source: Camera) -> tuple[int, int]:
         return self.image_size or source.size_for(self._name)

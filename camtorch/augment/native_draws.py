@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Set
 from ctypes import addressof, c_double, c_float
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -78,6 +78,11 @@ class Wanted(NamedTuple):
     owner: str  # the augmentation's name, for errors
 
 
+def _rows_of(camera: Camera) -> CameraRows:
+    tensors = [t.expand(*camera.batch_shape, t.shape[-1]) for t in camera.tensors]
+    return camera_rows(camera, *tensors)
+
+
 class Start:
     """Cameras that others are drawn from, as native code takes them; kept for as long as their numbers stay."""
 
@@ -87,14 +92,12 @@ class Start:
         source, base = wanted.source, wanted.base
         if not wanted.names <= DRAWN_KINDS.keys():
             return None
-        of_source, of_base = (
-            camera_rows(camera, *[t.expand(*camera.batch_shape, t.shape[-1]) for t in camera.tensors])
-            for camera in (source, base)
-        )
+        of_source, of_base = _rows_of(source), _rows_of(base)
         if of_source.native is None or of_base.native is None:
             return None
-        are_usable = of_source.usable is None and of_base.usable is None  # else flags say which numbers are no camera's
-        if not are_usable or {t.dtype for t in source.tensors} != {base.intrinsics.dtype}:
+        if of_source.usable is not None or of_base.usable is not None:  # flags of the numbers that are no camera's
+            return None
+        if {t.dtype for t in source.tensors} != {base.intrinsics.dtype}:
             return None
         return cls(wanted, of_source.native, of_base.native)
 
@@ -103,12 +106,13 @@ class Start:
         source, base = wanted.source, wanted.base
         self.base, self._source_native, self._base_native = base, source_native, base_native
         self._size, self._owner = wanted.size, wanted.owner
+        self._keeps_lens = base is source
         self._is_flat = source.turn_axis is None and base.turn_axis is None
         self._batch = tuple(wanted.sized.shape[:-1]) or base.batch_shape  # (B,) if each camera has a lens of its own
         self._distortion = base.distortion.detach()
         self._coefficients: np.ndarray[Any, Any] = self._distortion.numpy()  # of new cameras, unless they are jittered
-        self._sensitivity: Tensor | None = None  # to the values of `distortion`; None: coefficients stay
-        self._c_makes_lenses = False  # of coefficients that are jittered
+        self._sensitivity: Tensor | None = None  # of the image to the values of `distortion`, if they are jittered
+        self._lenses_by: Literal["base", "C", "candidates"] = "base"  # how new cameras come to their lenses
         self._needs_limits = False  # whether new lenses of an earlier call needed limits on azimuths
         height, width = wanted.size
         count = self._distortion.shape[-1]
@@ -124,7 +128,9 @@ class Start:
 
     def _keep(self, tensor: Tensor, *row: int) -> int:
         """Keep a tensor, of each camera if there are several, and return where its numbers lie."""
-        return self._call.keep((tensor.expand(*self._batch, *row) if self._batch and row else tensor).contiguous())
+        if self._batch and row:
+            tensor = tensor.expand(*self._batch, *row)
+        return self._call.keep(tensor.contiguous())
 
     def _add_base(self, wanted: Wanted) -> None:
         """Give new cameras the lens of the base, which is copied with its table, for those that unproject."""
@@ -157,11 +163,12 @@ class Start:
         """Have coefficients jittered, by steps that are measured on a lens of nominal intrinsics."""
         call, base, native, plan = self._call, self.base, self._base_native, self._base_native.plan
         measured = measured_once(sensitivity, remade(base, image_size=self._size), base.distortion, nominal)
-        self._sensitivity, call.sensitivity = measured, self._keep(measured, call.count)
+        self._lenses_by, self._sensitivity = "candidates", measured
+        call.sensitivity = self._keep(measured, call.count)
         call.coefficients = self._keep(self._distortion, call.count)
         call.border = self._keep(border(self._size, native.dtype))
         call.made.limits2 = call.made.extent = None  # which are those of the base
-        # C makes the new lenses if it can compute where they end; else `_candidates` makes them
+        # C makes the new lenses if it can compute where they end
         if plan.places is None or plan.chart_is_inverted or plan.is_long or not base.always_defined:
             return
         if plan.has_stages:
@@ -170,12 +177,12 @@ class Start:
                 return
             for name, radii in native.lenses.radii_wanted().items():
                 setattr(call.domain, name, self._keep(radii))
-        self._c_makes_lenses = True
+        self._lenses_by = "C"
         call.places = self._keep(plan.places)
         self._room += plan.parameters + 4 + TABLE_WIDTH
 
-    def warp(self, values: Mapping[str, Any], like: Camera, options: Options) -> LazyWarp:
-        """Return the warp to cameras `like` one, of values (B,) and (B, size), or numbers and lists for one."""
+    def warp(self, source: Camera, values: Mapping[str, Any], options: Options) -> LazyWarp:
+        """Return the warp from the source to new cameras of values (B,) and (B, size), or numbers and lists for one."""
         packed, batch = self._packed(values)
         rows = batch[0] if batch else 1
         number, dtype = self._types
@@ -196,35 +203,37 @@ class Start:
         intrinsics, rotation, k = numbers[:turns].reshape(*batch, 4), None, self._coefficients
         if self._turns:
             rotation = torch.from_numpy(numbers[turns:jittered].reshape(*batch, 3, 3))
-        if self._sensitivity is not None:
+        if self._lenses_by != "base":
             k = numbers[jittered : jittered + rows * call.count].reshape(*batch, call.count)
         native: Native | None = None
         if self._is_flat and not left:
             native = self._native(call, room, intrinsics, k)
+        like = source if self._keeps_lens else self.base
         return LazyWarp(like, intrinsics, k, self._size, rotation, options, self._source_native, native, zooms, filled)
 
     def _packed(self, values: Mapping[str, Any]) -> tuple[Any, tuple[int, ...]]:
         """Return drawn values kind after kind, as C takes them, and (B,); () for numbers and lists of one camera."""
-        given: list[Any] = [values[name] for name in self._names]
+        given: list[Any] = [*map(values.__getitem__, self._names)]
         if given and isinstance(given[0], np.ndarray):
             batch = self._batch or (len(given[0]),)
             numbers = np.concatenate(given, None)
-            self._check_count(len(numbers), batch[0])
+            if len(numbers) != batch[0] * self._drawn:
+                raise self._wrong_count(len(numbers), batch[0])
             return _array(c_double, len(numbers)).from_buffer(numbers), batch
         if len(given) < self._drawn:  # some values are several numbers
             flat: list[float] = []
             for value in given:
                 flat += value if isinstance(value, list) else (value,)
             given = flat
-        self._check_count(len(given), 1)
+        if len(given) != self._drawn:
+            raise self._wrong_count(len(given), 1)
         return _array(c_double, len(given))(*given), self._batch
 
-    def _check_count(self, count: int, rows: int) -> None:
-        """Raise a ValueError unless so many numbers are what cameras are made of, as C reads all of them."""
-        if count != self._drawn * rows:
-            several = [f"{name} as Range(low, high, {size})" for name, (_, size) in DRAWN_KINDS.items() if size > 1]
-            wanted = f"{self._drawn} numbers for a sample, {', '.join(several)}, and others as Range(low, high)"
-            raise ValueError(f"{self._owner}: ranges must draw {wanted}; got {count} for {rows} samples")
+    def _wrong_count(self, count: int, rows: int) -> ValueError:
+        """Return the error of so many numbers, as C reads all that cameras are made of."""
+        several = [f"{name} as Range(low, high, {size})" for name, (_, size) in DRAWN_KINDS.items() if size > 1]
+        wanted = f"{self._drawn} numbers for a sample, {', '.join(several)}, and others as Range(low, high)"
+        return ValueError(f"{self._owner}: ranges must draw {wanted}; got {count} for {rows} samples")
 
     def _run(self, call: structs.Draws, values: Mapping[str, Any]) -> int:
         """Have C write the new cameras; return flags, zero unless some numbers are no camera's.
@@ -232,9 +241,9 @@ class Start:
         C returns flags of limits and ends that it lacked. Python computes them and calls again; those of the source and
         the base serve all later draws.
         """
-        jitters = self._sensitivity is not None
-        needs_candidates = jitters and not self._c_makes_lenses and call.cameras > 0
-        candidates = self._candidates(values, call) if needs_candidates else None
+        candidates = None
+        if self._lenses_by == "candidates" and call.cameras:
+            candidates = self._candidates(values, call)
         if self._needs_limits:
             self._add_limits(call)
         run = loaded().camtorch_draws
@@ -242,7 +251,7 @@ class Start:
         while left & ~structs.NO_CAMERA:
             self._complete(left, values, call, candidates)
             left = run(call)
-        if jitters and call.followed < call.cameras:
+        if self._lenses_by != "base" and call.followed < call.cameras:
             call.made.limits2 = call.made.extent = None
         return left
 
@@ -251,8 +260,7 @@ class Start:
     ) -> Native | None:
         """Return the new cameras as native code takes them; None if it lacks the lenses of several."""
         base = self._base_native
-        has_lenses = self._c_makes_lenses if self._sensitivity is not None else base.cameras == call.cameras
-        if has_lenses:
+        if self._lenses_by == "C" or (self._lenses_by == "base" and base.cameras == call.cameras):
             # the function keeps the call, of which the struct is a part, and all that this points to
             return Native(base.plan, call.made, partial(self._lenses, call, room, k))
         if intrinsics.ndim == 1:
@@ -264,9 +272,11 @@ class Start:
         """Make the lenses that native code chooses among, of a model whose domain it does not make by itself."""
         measured = present(self._sensitivity, "the sensitivity to the values of distortion")
         amounts = torch.from_numpy(np.asarray(values["distortion"]).reshape(-1, structs.AMOUNTS))
-        steps = (amounts.repeat(1, -(-call.count // structs.AMOUNTS))[:, : call.count] * measured)[:, None]
+        amounts = amounts[:, torch.arange(call.count) % structs.AMOUNTS]  # of each coefficient
+        steps = (amounts * measured)[:, None]
         given = self._distortion.double().reshape(-1, 1, call.count)
-        tried = (given + given.new_tensor(structs.JITTER_PARTS)[:, None] * steps).to(self._base_native.dtype)
+        parts = given.new_tensor(structs.JITTER_PARTS)[:, None]
+        tried = (given + parts * steps).to(self._base_native.dtype)
         tried, allowed = defined_or(self.base, tried, given.to(tried).expand_as(tried))
         tried = tried.reshape(call.cameras * len(structs.JITTER_PARTS), call.count)
         lenses = CameraRows(model_of(self.base), tried.new_ones(len(tried), 4), tried)
@@ -302,7 +312,7 @@ class Start:
 
     def _lenses(self, call: structs.Draws, room: object, coefficients: np.ndarray[Any, Any]) -> Lenses:
         """Return the lenses of new cameras: those of the base, or new ones, kept for later ones of the same numbers."""
-        if self._sensitivity is None:
+        if self._lenses_by == "base":
             return self._base_native.lenses
         plan, model = self._base_native.plan, model_of(self.base)
         k = torch.from_numpy(coefficients.reshape(call.cameras, call.count))

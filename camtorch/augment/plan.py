@@ -105,24 +105,27 @@ class SamplePlan:
             return {}
         if not native_available():
             return self._pixels_at_once(part, values)
-        # Images whose colours or light change move on their own; of a `Warp` only images and pixels move here
         source: Native | None
         target: Native | None
         labels: Sequence[Label] = ()
         if isinstance(moves, LazyWarp):
-            source, target, rotation, size = moves.source_native, moves.target_native, moves.rotation, moves.image_size
+            source, target, rotation = moves.source_native, moves.target_native, moves.rotation
             if self.count == 1:
                 labels = _LABELS_OF_MIRRORS if moves.may_mirror else _LABELS_OF_TURNS
-        elif part.shades or part.light is not None or (natives := natives_of(moves)) is None:
-            return {}
         else:
-            (source, target, rotation), size = natives, moves.target.size_for("Warp")
-        # C lacks models of cameras, and takes one for each row
-        if source is None or target is None:
+            # Images whose colours or light change move on their own; of a `Warp` only images and pixels move here
+            natives = None if part.shades or part.light is not None else natives_of(moves)
+            if natives is None:
+                return {}
+            source, target, rotation = natives
+        if source is None or target is None:  # C lacks a model
             return {}
-        if max(source.cameras, target.cameras, 1 if rotation is None else rotation.numel() // 9) != self.count:
-            return {}
+        if self.count > 1:  # C takes a camera, or a turn, for each row
+            turns = 1 if rotation is None else rotation.numel() // 9
+            if self.count not in (source.cameras, target.cameras, turns):
+                return {}
         # The call is kept by all that it depends on, beside the form
+        size = moves.image_size
         settings = size, source.dtype, labels, thread_count(), *moves.options.values()
         known = calls.entry((), settings)
         if known is None:
@@ -130,7 +133,7 @@ class SamplePlan:
             names, narrowed, call = calls((), settings, new)
         else:
             names, narrowed, call = known.result
-        moved = None if call is None else call(source, target, rotation, [values[name] for name in names])
+        moved = None if call is None else call(source, target, rotation, [*map(values.__getitem__, names)])
         if moved is None:
             return {}
         results = dict(zip(names, moved, strict=True))
@@ -159,7 +162,8 @@ class SamplePlan:
             value = values[name]
             if isinstance(value, list) or field_of(kind, value).by_c == "never":
                 return _NO_CALL
-            if (how := self._how_of(kind, value, dtype, options, labels)) is not None:
+            how = self._how_of(kind, value, dtype, options, labels)
+            if how is not None:
                 hows[name] = how
         if not hows:
             return _NO_CALL
@@ -238,7 +242,8 @@ class Batch(NamedTuple):
 
 def move(change: Change, kind: str, value: Tensor, options: Mapping[str, float]) -> MovedField:
     """Return values (B, ...) of a kind moved by a change; those of one sample may have more dims, of frames."""
-    if lead := value.shape[1 : value.ndim - KINDS[kind].most_dims]:
+    lead = value.shape[1 : value.ndim - KINDS[kind].most_dims]
+    if lead:
         frames = change._with_parts([replace(part, rows=None) for part in change.parts], [0] * math.prod(lead))
         result, valid = move(frames, kind, value.flatten(0, len(lead)), options)
         valid = None if valid is None else valid.reshape(1, *lead, *valid.shape[1:])

@@ -14,7 +14,6 @@ of these forms:
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -33,8 +32,10 @@ RangeLike = float | Sequence[float]
 Draw = Mapping[str, Any]
 """A draw in any of its forms."""
 
+POSITIVE = frozenset({"zoom", "fov", "focal", "crop"})
+"""Names of ranges whose numbers make no camera unless they are positive."""
+
 Spans = SimpleNamespace  # by that name pickles of 0.4.0 have one that nothing reads
-_first = operator.itemgetter(0)
 _RADIANS = 0.8  # 45 degrees: a range of degrees within it is more likely in radians
 
 
@@ -107,7 +108,9 @@ def draw_numbers(
     if not (generator is None or isinstance(generator, torch.Generator)):
         raise TypeError(f"draw: generator must be a torch.Generator, or None; got {shown(generator)}")
     rows = min(count, 1) if same else count
-    total = rows * sum([interval.size or 1 for interval in ranges.values()])
+    total = 0
+    for interval in ranges.values():
+        total += rows * (interval.size or 1)
     device = "cpu" if generator is None else generator.device
     # the order is kornia's: the gate first
     gate = torch.rand(rows, generator=generator, dtype=torch.float32, device=device) < p if 0 < p < 1 else None
@@ -115,17 +118,11 @@ def draw_numbers(
     shares: Any = torch.rand(total, generator=generator, dtype=torch.float64, device=device)
     if not (shares.is_cpu and is_eager()):
         values: dict[str, Any] = {"apply": torch.full((rows,), p >= 1, device=device) if gate is None else gate}
-    elif rows == count == 1:
-        values, share = {"apply": [p >= 1] if gate is None else gate.tolist()}, iter(shares.tolist())
-        for name, one in ranges.items():  # values are drawn in their order
-            low, wide = one.low, one.high - one.low
-            values[name] = [
-                [low + wide * next(share) for _ in range(one.size)] if one.size else low + wide * next(share)
-            ]
-        return values
     else:
-        shares = shares.numpy()
-        values = {"apply": np.array([p >= 1] * rows if gate is None else gate.tolist(), bool)}
+        applied = [p >= 1] * rows if gate is None else gate.tolist()
+        if rows == count == 1:
+            return {"apply": applied, **_one_row(ranges, shares.tolist())}
+        values, shares = {"apply": np.array(applied, bool)}, shares.numpy()
     start = 0
     for name, interval in ranges.items():
         low, wide, end = interval.low, interval.high - interval.low, start + rows * (interval.size or 1)
@@ -135,16 +132,33 @@ def draw_numbers(
     return values if rows == count else rows_of(values, [0] * count)
 
 
+def _one_row(ranges: Mapping[str, Range], shares: Sequence[float]) -> dict[str, list[Any]]:
+    """Return the numbers of one sample at shares of their ranges, by name: lists (1,) or (1, size)."""
+    values: dict[str, list[Any]] = {}
+    start = 0
+    for name, interval in ranges.items():
+        low, size = interval.low, interval.size
+        wide = interval.high - low
+        if size is None:
+            values[name] = [low + wide * shares[start]]
+            start += 1
+        else:
+            values[name] = [[low + wide * share for share in shares[start : start + size]]]
+            start += size
+    return values
+
+
 def rows_of(draw: Draw, rows: list[int] | None) -> Draw:
     """Return these rows of a draw of arrays or tensors; None: all."""
     return {name: value if rows is None else value[rows] for name, value in draw.items()}
 
 
 def which_apply(applied: Any) -> list[bool] | None:
-    """Return which samples a draw moves, (B,), by its `apply`; None if values may not be read."""
+    """Return which samples a draw of arrays or tensors moves, (B,), by its `apply`; None if values may not be read."""
     if isinstance(applied, Tensor) and len(applied) and not is_cheap_to_read(applied):
         return None
-    return applied if isinstance(applied, list) else applied.tolist()
+    chosen: list[bool] = applied.tolist()
+    return chosen
 
 
 def values_for(source: Camera, draw: Draw) -> dict[str, Any]:
@@ -153,7 +167,9 @@ def values_for(source: Camera, draw: Draw) -> dict[str, Any]:
     If one camera serves all samples and all draws are equal, the dim *B is left out: one warp serves all.
     """
     if isinstance(draw["apply"], list):  # of one sample
-        values = dict(zip(draw, map(_first, draw.values()), strict=True))  # without a loop of Python
+        values = {}
+        for name, rows in draw.items():
+            values[name] = rows[0]
         del values["apply"]
         return values
     values = {name: value for name, value in draw.items() if name != "apply"}
@@ -176,11 +192,13 @@ def as_tensors(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
     return {n: torch.as_tensor(value, dtype=dtype, device=source.intrinsics.device) for n, value in values.items()}
 
 
-def checked_draw(draw: Mapping[str, Tensor], sizes: Mapping[str, int | None], owner: str) -> Draw:
+def checked_draw(draw: Mapping[str, Tensor], ranges: Mapping[str, Range], crops: Iterable[str], owner: str) -> Draw:
     """Return a draw that was given as arrays, or as tensors if numbers may not be read.
 
-    sizes: name -> how many numbers it holds for each sample; None: one, without a dim.
+    crops: further names, of a box (4,) for each sample.
     """
+    sizes: dict[str, int | None] = {name: interval.size for name, interval in ranges.items()}
+    sizes |= dict.fromkeys(crops, 4)
     as_mapping(draw, "draw", owner, "what draw() returns")
     if missing := [name for name in ("apply", *sizes) if name not in draw]:
         has = ", ".join(map(str, draw)) or "nothing"
@@ -198,6 +216,9 @@ def checked_draw(draw: Mapping[str, Tensor], sizes: Mapping[str, int | None], ow
             raise ValueError(f"{owner}: draw[{name!r}] must be {shape}; got shape {tuple(value.shape)}")
         if isinstance(value, np.ndarray) and not np.isfinite(value).all():
             raise ValueError(f"{owner}: draw[{name!r}] must be finite; got {value.tolist()}")
+        is_positive = name.rpartition(".")[2] in POSITIVE and ranges[name].low > 0
+        if is_positive and isinstance(value, np.ndarray) and not (value > 0).all():
+            raise ValueError(f"{owner}: draw[{name!r}] must be positive; got {value.tolist()}")
     return values
 
 

@@ -17,7 +17,6 @@ transform of torch.func holds, of one beside such a transform, of a dual one, an
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Sequence
 
 import torch
@@ -97,13 +96,14 @@ def are_numbers(*tensors: Tensor) -> bool:
 
 def hold_numbers(tensors: Sequence[Tensor]) -> bool:
     """Whether `are_numbers`, in less time, if it is known that nothing is traced or transformed."""
-    if not (_TYPES.issuperset(map(type, tensors)) and all(map(_is_cpu, tensors))):
-        return False
-    return not (torch.is_grad_enabled() and any(map(_requires_grad, tensors)))
+    records = torch.is_grad_enabled()
+    for tensor in tensors:
+        if type(tensor) not in _TYPES or not tensor.is_cpu or (records and tensor.requires_grad):
+            return False
+    return True
 
 
 _TYPES = frozenset((Tensor, nn.Parameter))
-_is_cpu, _requires_grad = map(operator.attrgetter, ("is_cpu", "requires_grad"))  # without loops of Python
 
 
 def is_kept(value: Tensor) -> bool:

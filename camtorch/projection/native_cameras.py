@@ -258,6 +258,10 @@ class Native:
         self.plan, self.struct, self.pointer, self._find_lenses = plan, struct, addressof(struct), lenses
         self.cameras, self.dtype = struct.cameras, torch.float64 if struct.is_double else torch.float32
 
+    def __deepcopy__(self, memo: object) -> Native:
+        """Return itself: the cameras stay, and their struct points to memory, which has no copies."""
+        return self
+
     @cached_property
     def lenses(self) -> Lenses:
         """The lenses of the cameras, which other cameras may share."""

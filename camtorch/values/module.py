@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, ParamSpec, TypeVar, cast
@@ -37,9 +36,10 @@ _CONTAINERS["_untraced"] = dict
 _RENAMED = {"_own": "_untraced", "_warned": "_expects_unusable"}  # attributes of older pickles
 
 
-def _new_containers() -> dict[str, Any]:
-    """Return the empty dicts and sets of a new module, in no loop of Python."""
-    return dict(zip(_CONTAINERS, map(operator.call, _CONTAINERS.values()), strict=True))
+def _add_containers(state: dict[str, Any]) -> None:
+    """Put the empty dicts and sets of a new module into its state."""
+    for name, kind in _CONTAINERS.items():
+        state[name] = kind()
 
 
 class UnsharedState(nn.Module):
@@ -72,7 +72,7 @@ class GeometryModule(UnsharedState):
         else:
             state = self.__dict__
             state.update(_BARE, **attributes)
-            state.update(_new_containers())
+            _add_containers(state)
             parts = state["_modules"]
             for name, module in modules.items():
                 (state if module is None else parts)[name] = module
@@ -312,7 +312,7 @@ def remade(module: Made, learns: bool = False, /, **changes: Any) -> Made:
         made = model.__new__(model)
         state = made.__dict__
         state.update(module.__dict__, _is_full_backward_hook=None, **changes)
-        state.update(_new_containers())
+        _add_containers(state)
         for name in module.memo_names:
             state[name] = Kept.__new__(Kept)  # without a call of Python
         parameters, untraced = state["_parameters"], state["_untraced"]

@@ -107,6 +107,31 @@ def test_cameras_and_draws(camera):
             call()
 
 
+@pytest.mark.parametrize("name", ["zoom", "fov", "focal", "crop"])
+def test_numbers_of_a_draw_that_make_no_camera(camera, name):
+    augment = RandomCamera(zoom=(1, 2), fov=(50, 60), crop=(0.5, 1), camera=camera)
+    both, draw = ct.augment.Compose([augment]), augment.draw(2)
+    for value in (0.0, -1.0):
+        wrong = {**draw, name: torch.tensor([1.0, value])}
+        with pytest.raises(ValueError, match=rf"RandomCamera: draw\['{name}'\] must be positive; got \[1.0, {value}\]"):
+            augment(image=torch.rand(2, 3, *SIZE), draw=wrong)
+        wrong = {**both.draw(2), f"0.{name}": torch.tensor([1.0, value])}
+        with pytest.raises(ValueError, match=rf"Compose: draw\['0.{name}'\] must be positive; got"):
+            both(image=torch.rand(2, 3, *SIZE), draw=wrong)
+
+
+@pytest.mark.parametrize("as_list", [False, True], ids=["batch", "models"])
+def test_a_sample_with_other_coefficients_has_no_inverse(as_list):
+    lenses = [ct.KannalaBrandt([30.0, 30, 19.5, 14.5], [0.01 * i, 0, 0, 0], image_size=SIZE) for i in range(2)]
+    cameras = [*lenses, ct.Pinhole([30.0, 30, 19.5, 14.5], image_size=SIZE)] if as_list else lenses
+    augment = RandomMount(min_filled=0)
+    moved = augment(keypoints=torch.zeros(len(cameras), 5, 2), camera=cameras)
+    augment.inverse(moved)
+    moved["camera"][1] = ct.KannalaBrandt(moved["camera"][1].intrinsics, [0.2, 0, 0, 0], image_size=SIZE)
+    with pytest.raises(ValueError, match="camera and rotation of the sample must be those that this change made"):
+        augment.inverse(moved)
+
+
 @pytest.mark.parametrize("learns", [False, True], ids=["by C", "by torch"])
 def test_a_lens_that_cannot_be_so_wide_is_told_of_alike(camera, learns):
     wide, source = RandomLens("pinhole", fov=190), camera.clone().requires_grad_(learns)

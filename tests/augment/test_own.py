@@ -111,3 +111,29 @@ def test_a_face_normalizer_draws_nothing():
     transform = ct.augment.numpy.Transform(ct.augment.FaceNormalizer(camera=camera()))
     with pytest.raises(TypeError, match="draw and generator must be None for a FaceNormalizer"):
         transform(image=torch.rand(*SIZE).numpy(), generator=torch.Generator())
+
+
+class Aimed(ct.augment.Augmentation):
+    """A camera that turns by an angle which is learnt."""
+
+    def __init__(self, **options):
+        super().__init__({"share": ct.augment.Range(0.9, 1.1)}, **options)
+        self.angle = torch.nn.Parameter(torch.tensor(3.0))
+
+    def new_camera(self, source, values):
+        yaw, none = values["share"] * self.angle, 0 * values["share"]
+        return source, ct.augment.mount_rotation(yaw, none, none)
+
+
+@pytest.mark.parametrize("following", [False, True], ids=["first", "last"])
+@pytest.mark.parametrize("lead", [(), (2,)], ids=["one", "batch"])
+def test_in_a_chain_gradients_reach_a_rotation_that_is_learnt(following, lead):
+    mount, aimed = ct.augment.RandomMount(min_filled=0), Aimed(min_filled=0)
+    camera = ct.Pinhole([60.0, 60, 39.5, 29.5], image_size=(60, 80)).requires_grad_(False)
+    chain = ct.augment.Compose([mount, aimed] if following else [aimed, mount], camera=camera)
+    fields = {"image": torch.rand(*lead, 3, 60, 80), "gaze": torch.randn(*lead, 3)}
+    fields["keypoints"] = 20 * torch.rand(*lead, 4, 2)
+    moved = chain(fields)
+    for name in (*fields, "rotation"):
+        (slope,) = torch.autograd.grad(moved[name].sum(), aimed.angle, retain_graph=True)
+        assert slope != 0, name

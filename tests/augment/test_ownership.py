@@ -93,3 +93,16 @@ def test_a_single_sample_stays_single_and_the_callers():
     names = list(given)
     AUGMENTATIONS["face"].inverse(given)
     assert list(given) == names
+
+
+@pytest.mark.parametrize("lead", [(), (COUNT,)], ids=["one", "batch"])
+@pytest.mark.parametrize("kind", [RandomMount, RandomLens, RandomCamera])
+def test_a_copy_of_a_change_moves_as_the_change_does(kind, lead):
+    augment = kind(camera=camera(), min_filled=0.9)
+    fields = {"image": torch.rand(*lead, 3, *SIZE), "keypoints": 40 * torch.rand(*lead, 5, 2)}
+    moved = augment(fields)
+    twin = copy.deepcopy(augment.last)
+    for change, given in ((twin, fields), (copy.deepcopy(twin), fields), (twin.inverse(), moved)):
+        wanted = augment.moved_by(augment.last if given is fields else augment.last.inverse(), given)
+        found = augment.moved_by(change, given)
+        assert all(torch.equal(found[name], wanted[name]) for name in fields)
