@@ -144,7 +144,8 @@ class Augmentation(SampleTransform):
         Returns:
             `apply` (B,) bool, and for each range a float64 tensor (B,) or (B, size) of that name and unit.
         """
-        if (count := as_whole(count, "count", self._name)) < 0:
+        count = as_whole(count, "count", self._name)
+        if count < 0:
             raise ValueError(f"{self._name}: count must not be negative; got {count}")
         return self.drawn(count, self.p, self.same_on_batch, generator)
 
@@ -214,9 +215,8 @@ class Augmentation(SampleTransform):
 
     def _on_host(self, camera: Camera) -> Camera:
         """Return the camera, or its twin on the CPU if new cameras follow from the numbers alone."""
-        if camera.intrinsics.is_cpu or not self.drawn_on_host:
-            return camera
-        return twin_of(camera) or camera
+        twin = twin_of(camera) if self.drawn_on_host else None
+        return camera if twin is None else twin
 
     def _change(self, camera: Camera, draw: Draw) -> Change:
         """Return the change of a draw of any form."""
@@ -237,7 +237,8 @@ class Augmentation(SampleTransform):
 
     def _change_of_some(self, camera: Camera, draw: Draw, chosen: Sequence[bool]) -> Change:
         """Return the change that moves only the chosen samples."""
-        count, parts, camera = len(chosen), [], one_or_batch(camera)
+        count, parts = len(chosen), []
+        camera = one_or_batch(camera)
         for rows, group in camera.groups if isinstance(camera, Mixed) else [(list(range(count)), camera)]:
             for moves in (True, False):
                 here = [n for n, row in enumerate(rows) if chosen[row] == moves]

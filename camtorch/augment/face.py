@@ -97,7 +97,8 @@ class FaceNormalizer(SampleTransform):
         Raises:
             ValueError: If a face is at the camera, or seen along the head's x axis.
         """
-        device, dtype = camera.intrinsics.device, torch.promote_types(camera.intrinsics.dtype, torch.float32)
+        device = camera.intrinsics.device
+        dtype = torch.promote_types(camera.intrinsics.dtype, torch.float32)
         check_rotation(head_rotation, "the head's rotation", self._name)
         camera = one_or_batch(camera)
         centre, across = face_centre.to(device, dtype), head_rotation[..., 0].to(device, dtype)

@@ -132,7 +132,10 @@ def _sided_boxes(kind: str, form: str) -> Field:
 
     def check_sides(value: Tensor, name: str, owner: str) -> None:
         _check_form(kind, value, name, owner)
-        if not value.requires_grad and known_true((negative := (value[..., 2:] < 0).any(-1)).any()):
+        if value.requires_grad:
+            return
+        negative = (value[..., 2:] < 0).any(-1)
+        if known_true(negative.any()):
             raise ValueError(
                 f"{owner}: {name} must be {shape}, with sides of 0 or more; got {value[negative][0].tolist()}. Boxes "
                 "x1, y1, x2, y2 are of the kind 'boxes'"

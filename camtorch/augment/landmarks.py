@@ -304,10 +304,12 @@ def face_points(landmarks: str = "ibug68") -> Tensor:
     name = one_of(landmarks, _WITH_POINTS, "landmarks", "face_points")
     if name == "insightface106":
         return face_points("lapa106")[torch.tensor(INSIGHTFACE).argsort()]
-    mesh, order = np.loadtxt(Path(__file__).with_name("mediapipe_face.txt")) / 1e5, LANDMARKS[name]
+    mesh = np.loadtxt(Path(__file__).with_name("mediapipe_face.txt")) / 1e5
+    order = LANDMARKS[name]
     if name not in _RUNS:
         return torch.from_numpy(mesh[: len(order)])
-    points, mirror, jaw = np.empty((len(order), 3)), np.array([-1, 1, 1]), _JAW[name]
+    points, jaw = np.empty((len(order), 3)), _JAW[name]
+    mirror = np.array([-1, 1, 1])
     right = mesh[list(_OVAL)]
     outline = np.concatenate((right, (right * mirror)[-2::-1]))
     along = np.cumsum([0, *np.linalg.norm(np.diff(outline, axis=0), axis=1)])

@@ -39,7 +39,8 @@ class Guess(float):
         """Return a number as a `Guess`, and all else as it is."""
         if not isinstance(camera, numbers.Real) or isinstance(camera, (bool, Guess)):
             return camera
-        if not 0 < (degrees := float(camera)) < 180:
+        degrees = float(camera)
+        if not 0 < degrees < 180:
             raise ValueError(
                 f"{owner}: camera must be a Camera, or degrees across of a guessed pinhole, above 0 and below 180; "
                 f"got {camera!r}"
@@ -112,7 +113,8 @@ def pinhole_of_matrix(name: str, matrix: Tensor | list[Tensor], size: tuple[int,
             )
         check_matrix(row, name, owner)
     numbers = torch.stack([numbers_of(row) for row in rows]) if isinstance(matrix, list) else numbers_of(matrix)
-    if (off := off_centre(numbers, size)) and first_time(("matrix of another image", owner)):
+    off = off_centre(numbers, size)
+    if off and first_time(("matrix of another image", owner)):
         warn_of_order(off, size, owner)
         warn_of_size(off, size, owner)
     return pinhole(numbers, size)

@@ -40,13 +40,15 @@ def kind_of(name: str, value: object, fields: Mapping[str, str], owner: str, sin
     if name.endswith("_valid"):
         return None
     kind = name if name in KINDS else ALIASES.get(name)
-    if kind is None and (pattern := pattern_of(name, fields)) is not None:
+    pattern = pattern_of(name, fields) if kind is None else None
+    if pattern is not None:
         return None if fields[pattern] == KEEP else fields[pattern]
     if kind == "K":
         return _kind_of_matrix(name, value, single)
     kind = kind or _beginning(name, value)
-    if kind == "boxes" and (form := f"boxes_{name.rpartition('_')[2]}") in BOXES:  # as boxes_face_xywh
-        kind = form
+    if kind == "boxes":
+        form = f"boxes_{name.rpartition('_')[2]}"  # as of boxes_face_xywh
+        kind = form if form in BOXES else kind
     if kind is None and _may_be_geometry(name, value, single):
         _refuse_unknown(name, value, owner)
     return kind

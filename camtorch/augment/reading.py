@@ -55,7 +55,8 @@ def check_fields(
     for name, (kind, value) in named.items():
         several, field = isinstance(value, list), KINDS[kind]
         for i, item in enumerate(value if several else [value]):
-            which, more = f"{name}[{i}]" if several else name, item.ndim - field.most_dims
+            which = f"{name}[{i}]" if several else name
+            more = item.ndim - field.most_dims
             frame = item.new_empty(item.shape[more:]) if more > 0 and has_frames else item
             check_shape(kind, which, frame, batched and not several, owner)
             if mode is None:
@@ -152,7 +153,8 @@ def check_shape(kind: str, name: str, value: Tensor, batched: bool, owner: str) 
     fits = not field.ends or any(shape[-len(end) :] == end for end in field.ends)
     if not fits or not field.dims <= len(shape) - batched <= field.most_dims:
         what = field.shape if batched else field.shape.replace("(B, ", "(")
-        hint = f". {hint}" if (hint := field.hint(value, name, batched)) else _hint(name)
+        hint = field.hint(value, name, batched)
+        hint = f". {hint}" if hint else _hint(name)
         raise ValueError(f"{owner}: {name} must be {what}; got shape {shape}{hint}")
 
 
@@ -198,8 +200,9 @@ def _are_off(points: Tensor, flags: Any, size: Sequence[int]) -> bool:
     if all(-_OFF * side < low and high < (1 + _OFF) * side - 1 for low, high, side in ends):  # as in most samples
         return False
     seen = torch.isfinite(pixels).all(-1)
-    if flags is not None and (given := torch.as_tensor(flags)).numel() == len(seen):
-        seen = seen & (given.reshape(-1) != 0)
+    if flags is not None:
+        given = torch.as_tensor(flags).reshape(-1)
+        seen = seen & (given != 0) if len(given) == len(seen) else seen
     off = ((pixels + 0.5) / pixels.new_tensor(sides) - 0.5).abs().amax(-1) > 0.5 + _OFF
     return int((off & seen).sum()) > int(seen.sum()) / 2
 

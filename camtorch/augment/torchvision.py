@@ -114,8 +114,8 @@ class Transform(FrontEnd, v2.Transform):
 
         That function takes the moved sample and the change, and returns a nest like the given one.
         """
-        nest, augmentation = _Nest(given), self.augmentation
-        keys, leaves = nest.keys, nest.leaves
+        nest = _Nest(given)
+        keys, leaves, augmentation = nest.keys, nest.leaves, self.augmentation
         fields = {i: _read_leaf(nest.names[i], leaves[i], kind) for i, kind in self._kinds(nest).items()}
         cameras = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Camera)]
         for name, count in (("camera", len(cameras)), (PLACE, nest.names.count(PLACE))):
@@ -138,10 +138,10 @@ class Transform(FrontEnd, v2.Transform):
             added.append("camera")
 
         def write(moved: Sample, change: Change) -> Any:
-            stays, size = change.parts[0].moves is None, change.parts[0].image_size
+            part = change.parts[0]
             for i, field in fields.items():  # where nothing moves, PIL images and tv_tensors stay as they are
-                if not (stays and field.kind) or type(leaves[i]) in _HELD:
-                    leaves[i] = field.write(moved[keys[i]], size)
+                if part.moves is not None or not field.kind or type(leaves[i]) in _HELD:
+                    leaves[i] = field.write(moved[keys[i]], part.image_size)
             for i in cameras:
                 leaves[i] = moved["camera"]
             result = pytree.tree_unflatten(leaves, nest.spec)
@@ -159,8 +159,8 @@ class Transform(FrontEnd, v2.Transform):
 
     def _kinds(self, nest: _Nest) -> dict[int, str | None]:
         """Return the kind of each leaf that moves, and None for those that may be flags or orders of landmarks."""
-        fields, problems = self.augmentation.fields, dict[int, ValueError]()
-        kinds: dict[int, str | None] = {}
+        fields = self.augmentation.fields
+        kinds, problems = dict[int, str | None](), dict[int, ValueError]()
         single = all(getattr(leaf, "ndim", 0) < 4 for leaf in nest.leaves)  # images of batches have as many dims
         for i, (name, leaf) in enumerate(zip(nest.names, nest.leaves, strict=True)):
             if name == PLACE:

@@ -74,7 +74,8 @@ class Transform(FrontEnd, A.DualTransform):
     def __init__(self, augmentation: Augmentation, camera: Camera | float | None = None, p: float | None = None):
         augmentation, camera = from_plain(augmentation, _OWNER), from_plain(camera, _OWNER)  # as of `A.load`
         check_front_end(_OWNER, augmentation)
-        self.augmentation, self.camera, self._arrays = augmentation, camera, arrays.Transform(augmentation)
+        self.augmentation, self.camera = augmentation, camera
+        self._arrays = arrays.Transform(augmentation)
         super().__init__(p=augmentation.p if p is None else p)
 
     @property
@@ -106,8 +107,9 @@ class Transform(FrontEnd, A.DualTransform):
 
     def _read(self, data: dict[str, Any]) -> tuple[Sample, Callable[[Sample], Sample]]:
         """Return targets as `numpy.Transform` takes them, and the function that writes moved ones as given."""
-        camera, targets = self._source(data), {}
+        camera = self._source(data)
         fields = {} if isinstance(camera, Unknown) else {"camera": camera}
+        targets = {}  # field -> its name in the sample, and the target of that name
         for i, (name, value) in enumerate(data.items()):
             target = self._additional_targets.get(name, name)
             stays = value is None or name in ("camera", "applied_transforms", self.save_key)
@@ -123,7 +125,7 @@ class Transform(FrontEnd, A.DualTransform):
 
         def write(moved: Sample) -> Sample:
             change = present(self.augmentation.last, "the change of the call that moved")
-            followed = ("camera", PLACE, "rotation") if PLACE in moved else ("camera",)  # it follows from both
+            followed = ("camera", PLACE, "rotation") if PLACE in moved else ("camera",)  # the crop's follows from both
             result = data | {name: moved[name] for name in followed if name in moved}
             for field, (name, target) in targets.items():
                 seen = moved.get(f"{field}_valid")
@@ -136,13 +138,13 @@ class Transform(FrontEnd, A.DualTransform):
 
     def _source(self, data: dict[str, Any]) -> Camera:
         """Return the camera of a sample's images."""
-        given = {name: data[name] for name in ("image", "mask", "images", "masks") if data.get(name) is not None}
-        planes = {name: value[:1] if name in ("images", "masks") else [value] for name, value in given.items()}
-        sizes = [(name, np.shape(one)[:2]) for name, several in planes.items() for one in several]
-        camera = self.camera if data.get("camera") is None else data["camera"]
+        sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]
+        several = [name for name in ("images", "masks") if data.get(name) is not None and len(data[name])]
+        sizes += [(name, np.shape(data[name][0])[:2]) for name in several]
+        given = self.camera if data.get("camera") is None else data["camera"]
         matrices = ((name, value) for name, value in data.items() if value is not None and self._is_matrix(name, value))
         return camera_of_sample(
-            _OWNER, camera, self.augmentation.camera, self.augmentation.needs_camera, sizes, next(matrices, None)
+            _OWNER, given, self.augmentation.camera, self.augmentation.needs_camera, sizes, next(matrices, None)
         )
 
     def _is_matrix(self, name: str, value: Any) -> bool:

@@ -54,7 +54,8 @@ def from_plain(value: Any, owner: str) -> Any:
     if not isinstance(value, Mapping):
         return value
     state = {key: from_plain(one, owner) for key, one in value.items()}
-    if (name := state.pop(_CLASS, "Camera")) == "Camera":
+    name = state.pop(_CLASS, "Camera")
+    if name == "Camera":
         return Camera.from_dict(state)
     kinds = {_name_of(kind): kind for kind in (*_SAVED, *_augmentations(Augmentation))}
     if name not in kinds:

@@ -104,7 +104,8 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
             same_on_batch=augmentation.same_on_batch if same_on_batch is None else same_on_batch,
             keepdim=keepdim,
         )
-        self.augmentation, self.camera, options = augmentation, camera, augmentation.options
+        self.augmentation, self.camera = augmentation, camera
+        options = augmentation.options
         kind_of_camera(self.camera_for((1, 1)))  # which torch.compile looks up
         self.flags: dict[str, Any] = {"resample": Resample.get(options["mode"]), "align_corners": False}
         self.flags["padding_mode"] = SamplePadding.get(options["padding_mode"])
@@ -206,7 +207,8 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
         return self._move(input, params, flags, lambda change, images: change.images(images, **options))[0]
 
     def apply_transform_mask(self, input: Tensor, params: Params, flags: Flags, transform: Any = None) -> Tensor:
-        fill, mode = self.augmentation.mask_fill, cast("Mode", Resample.get(flags["resample"]).name.lower())
+        fill = self.augmentation.mask_fill
+        mode = cast("Mode", Resample.get(flags["resample"]).name.lower())
         return self._move(input, params, flags, lambda change, masks: change.labels(masks, fill, mode))[0]
 
     def apply_transform_keypoint(self, input: Keypoints, params: Params, flags: Flags, transform: Any = None) -> Any:
@@ -228,7 +230,8 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
         return self.apply_transform(self.transform_tensor(input), params, {**flags, **more, _BACK: True})
 
     def inverse_masks(self, input: Tensor, params: Params, flags: Flags, transform: Any = None, **more: Any) -> Tensor:
-        shape, flags = params["forward_input_shape"], {**flags, "resample": Resample.NEAREST, **more, _BACK: True}
+        shape = params["forward_input_shape"]
+        flags = {**flags, "resample": Resample.NEAREST, **more, _BACK: True}
         rows = self.transform_tensor(input, shape=shape, match_channel=False)
         moved = self.apply_transform_mask(rows, params, flags)
         return transform_output_shape(moved, input.shape, reference_shape=shape) if self.keepdim else moved

@@ -44,7 +44,8 @@ class _Dict(NamedTuple):
 
 
 def _read_dict(container: Any, given: Sample, ours: list[FrontEnd]) -> _Dict:
-    owner, texts = type(container).__name__, {name: value for name, value in given.items() if is_text(value)}
+    owner = type(container).__name__
+    texts = {name: value for name, value in given.items() if is_text(value)}
     rest = {name: value for name, value in given.items() if name not in texts}
     keys = {name: container._read_datakeys_from_dict((name,))[0] for name in rest}
     unknown = [n for n, key in keys.items() if n not in OWN and key in ([], [DataKey.CLASS], [DataKey.LABEL])]
@@ -139,8 +140,8 @@ def _with_fields(
             dims = (3, 5) if self.contains_video_sequential else (2, 4)
             params = self.forward_parameters(self.autofill_dim(read.image, dim_range=dims)[1])
         params = with_cameras(params, camera)
-    result, fields = call(self, read.rest, params=params), read.fields
-    kinds, with_camera = read.kinds, read.camera is not None
+    result = call(self, read.rest, params=params)
+    fields, kinds, with_camera = read.fields, read.kinds, read.camera is not None
     applied = [pair for pair in params_of_each(self._params if params is None else params, self) if pair[0] in ours]
     for one, its_params in reversed(applied) if back else applied:
         adds_place = one.augmentation.place and not back
