@@ -44,11 +44,16 @@ def within(fold: Tensor) -> Tensor:
 
 
 def first_loss(orientation: Tensor, spared: Tensor | None = None) -> Tensor:
-    """Return the node (*B, A) at which (*B, A, S) is first lost, or dips outside of `spared`; S if never."""
+    """Return the node (*B, A) at which (*B, A, S) is first lost, or dips outside of `spared`; S if never.
+
+    The parabola through the values at three nodes is here - tilt x / 2 + bend x^2 / 2, at x nodes from the middle one.
+    Its bottom is here - tilt^2 / (8 bend), at x = tilt / (2 bend).
+    """
     before, here, after = orientation[..., :-2], orientation[..., 1:-1], orientation[..., 2:]
     bend, tilt = before - 2 * here + after, before - after
     bend_safe = torch.where(bend > 0, bend, 1.0)
-    dips = (bend > 0) & (tilt.abs() <= bend) & (here - tilt * tilt / (8 * bend_safe) <= 0)
+    is_between = (bend > 0) & (tilt.abs() <= bend)  # the bottom is within half a node
+    dips = is_between & (here - tilt * tilt / (8 * bend_safe) <= 0)
     dips = dips if spared is None else dips & ~spared[..., 1:-1]
     offset = torch.where(dips & (here > 0), tilt / (2 * bend_safe), 0.0)
     nodes = torch.arange(orientation.shape[-1], dtype=orientation.dtype, device=orientation.device)
@@ -66,25 +71,34 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
         return radial.fold.clamp(max=end)
     # the fold is searched for if the numbers are not known
     k = radial.parameters[0]
-    known = k.dtype == torch.float64 and not k.is_meta
-    if known and (fold := radial.closed_fold()) is not None:
-        fold = fold.clamp(max=end)
+    fold = radial.closed_fold() if k.dtype == torch.float64 and not k.is_meta else None
+    if fold is not None:
+        return _up_to_numbers(radial, fold.clamp(max=end), most)
+    return _followed_to_fold(radial, sampled(), end, most)
 
-        def is_number(radius: Tensor) -> Tensor:
-            return radius * radial(radius * radius) <= most
 
-        if bool((good := is_number(fold)).all()):
-            return fold
-        low, high = fold, fold
-        for _ in range(_MOST_ROOTS):
-            low = torch.where(good | is_number(low), low, torch.where(low > 2, low.sqrt(), low / 2))
-        for _ in range(64):
-            middle = low.sqrt() * high.sqrt()
-            inside = is_number(middle)
-            low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
-        return torch.where(good, fold, low)
+def _up_to_numbers(radial: RadialFactor, fold: Tensor, most: float) -> Tensor:
+    """Return the fold, or the radius (C, 1) before it from which the factor's image is above `most`."""
 
-    radii = sampled()
+    def is_number(radius: Tensor) -> Tensor:
+        return radius * radial(radius * radius) <= most
+
+    good = is_number(fold)
+    if bool(good.all()):
+        return fold
+    # roots of the radius, until its image is a number; then bisection of its logarithm
+    low, high = fold, fold
+    for _ in range(_MOST_ROOTS):
+        low = torch.where(good | is_number(low), low, torch.where(low > 2, low.sqrt(), low / 2))
+    for _ in range(64):
+        middle = low.sqrt() * high.sqrt()
+        inside = is_number(middle)
+        low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
+    return torch.where(good, fold, low)
+
+
+def _followed_to_fold(radial: RadialFactor, radii: Tensor, end: float | Tensor, most: float) -> Tensor:
+    """Return `fold_of` (C, 1) of a factor that is followed outwards at radii (RADII,)."""
 
     def orientation(radius: Tensor) -> Tensor:
         found, image = radial.orientation(radius), radius * radial(radius * radius)
@@ -93,42 +107,46 @@ def fold_of(radial: RadialFactor, sampled: Callable[[], Tensor], end: float | Te
     nodes = radii.clamp(max=end)
     followed = orientation(nodes)
     nodes, lost = nodes.expand_as(followed), first_loss(followed).unsqueeze(-1)
-    some = lost < nodes.shape[-1]
+    last = nodes.shape[-1] - 1
 
     def node(index: Tensor) -> Tensor:
-        return nodes.gather(-1, index.long().clamp(0, nodes.shape[-1] - 1))
+        return nodes.gather(-1, index.long().clamp(0, last))
 
+    # the interval in which it is lost; at a dip between nodes its upper end is the bottom of the parabola
     low, high = node((lost - 1).floor()), node(lost.ceil())
-    # at a dip between nodes the upper end is the bottom of its parabola
-    at_dip = node(lost.floor()) + (lost - lost.floor()) * (high - node(lost.floor()))
+    before_dip = node(lost.floor())
+    at_dip = before_dip + (lost - lost.floor()) * (high - before_dip)
     high = torch.where(lost == lost.floor(), high, at_dip)
+    # divided twice
     steps = torch.linspace(0, 1, _PARTS + 1, dtype=radii.dtype, device=radii.device)
     for _ in range(2):
         inner = low + (high - low) * steps
         # the upper end counts as lost, whatever its rounding is
         first = (orientation(inner) > 0).long().cumprod(-1).sum(-1, keepdim=True).clamp(1, _PARTS)
         low, high = inner.gather(-1, first - 1), inner.gather(-1, first)
+    # and at last a secant
     before, after = orientation(low), orientation(high)
     crossing = (before > 0) & (after < 0)
-    fraction = torch.where(crossing, before / torch.where(crossing, before - after, 1.0), 0.0)
-    return torch.where(some, low + fraction * (high - low), end)
+    share = torch.where(crossing, before / torch.where(crossing, before - after, 1.0), 0.0)
+    return torch.where(lost <= last, low + share * (high - low), end)
 
 
 def tabulate(radial: RadialFactor, fold: Tensor, usual_end: float | Tensor) -> Tensor:
     """Return the table (C, 2 + 2 nodes) of an `InverseTable`."""
+    # at points in even steps, the factor by which the inverse scales their images back, and the images' squared radii
     end = fold.clamp(max=usual_end)
     u = torch.linspace(0, 1, NODES + 1, dtype=fold.dtype, device=fold.device)
     square = _square(u, end * end)
     factor = radial(square)
-    r2 = (square * factor * factor).cummax(-1).values
+    scale, r2 = factor.reciprocal(), (square * factor * factor).cummax(-1).values
     reach2 = r2[..., -1:]
-    # the places of the nodes' images, and the values at nodes that are even there
+    # the nodes are images in even steps: there it is interpolated
     at = _variable(r2, reach2)
     cell = (torch.searchsorted(at, u.expand_as(at).contiguous(), right=True) - 1).clamp(0, NODES - 1)
     low, high = at.gather(-1, cell), at.gather(-1, cell + 1)
-    scale = factor.reciprocal()
     before, step = scale.gather(-1, cell), scale.diff(dim=-1).gather(-1, cell)
     values = before + ((u - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1) * step
+    # and improved by two of Newton's steps for s R(r2 s^2) = 1, none longer than that between its neighbours
     wanted = _square(u, reach2)
     for _ in range(2):
         t = wanted * values * values
@@ -141,14 +159,16 @@ def tabulate(radial: RadialFactor, fold: Tensor, usual_end: float | Tensor) -> T
     return torch.cat((reach2, most2, values[..., :-1], values.diff(dim=-1)), -1)
 
 
-def _square(u: Tensor, top2: Tensor) -> Tensor:
-    x = u * (2 - u) * (top2 / (top2 + _HALF_WAY))
-    return _HALF_WAY * x / (1 - x)
-
-
 def _variable(r2: Tensor, top2: Tensor) -> Tensor:
+    """Return the variable u of an `InverseTable`, from 0 to 1 at `top2`, for squared radii."""
     x = r2 / (r2 + _HALF_WAY) * ((top2 + _HALF_WAY) / top2)
     return 1 - (1 - x).clamp(min=0).sqrt()
+
+
+def _square(u: Tensor, top2: Tensor) -> Tensor:
+    """Return the squared radii whose `_variable` is u."""
+    x = u * (2 - u) * (top2 / (top2 + _HALF_WAY))
+    return _HALF_WAY * x / (1 - x)
 
 
 class InverseTable:

@@ -1,4 +1,8 @@
-"""A lens followed outwards on azimuths: how far out it stays one-to-one, and where to start its inverse."""
+"""A lens followed outwards on azimuths: how far out it stays one-to-one, and where to start its inverse.
+
+A lens folds where its orientation is lost, see `StageAt.orientation`. It is followed at ascending radii, the nodes,
+from the centre of the chart's plane. The place of a loss is a number of nodes, and may lie between two of them.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +25,29 @@ if TYPE_CHECKING:
 _RADII = 2048  # to find the fold of the radial factor
 
 
+class Extent(NamedTuple):
+    """The reach of the lenses of cameras (C,) on their azimuths.
+
+    radii: (C, radii). reach: (C, azimuths, radii), how far from the centre they go, ascending; infinite past the fold.
+    furthest: (C, azimuths), the distance that no point before the fold exceeds in each direction of the image.
+    """
+
+    radii: Tensor
+    reach: Tensor
+    furthest: Tensor
+
+    def start(self, camera: Tensor, target: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        """Return the radius (M,) before the fold at which a point's lens nearly reaches `target` towards (a, b)."""
+        count = self.radii.shape[-1]
+        reach, row = self.reach.flatten(), (camera * AZIMUTHS + azimuth(a, b, 0.5)) * count
+        node = _last_not_above(reach, row, count, target)
+        near, far = reach[row + node], reach[row + node + 1]
+        # next to the fold only its inner side is a safe start
+        share = torch.where(far < torch.inf, (target - near) / torch.where(far > near, far - near, 1.0), 0.0)
+        inner, outer = (self.radii.flatten()[camera * count + node + i] for i in range(2))
+        return inner + share.clamp(0, 1) * (outer - inner)
+
+
 def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
     """Follow lenses of coefficients (C, n) that are not radial outwards on azimuths of the chart's plane. Graph-free.
 
@@ -30,107 +57,96 @@ def limits_and_extent(optics: Optics, k: Tensor) -> tuple[Tensor, Extent]:
     """
     chart, lens = optics(columns(k))
     radii = _around(lens.radial, chart, chart.radii(_RADII, k)).expand(k.shape[0], -1)
-    # the azimuths of each camera are rows
-    rows = radii.repeat_interleave(AZIMUTHS, 0)
+    # each camera has as many rows as there are azimuths
     chart, lens = optics(columns(k.repeat_interleave(AZIMUTHS, 0)))
-    directions = (c.repeat(k.shape[0]) for c in _directions(radii))
+    rows, directions = radii.repeat_interleave(AZIMUTHS, 0), (c.repeat(k.shape[0]) for c in _directions(radii))
     followed = _follow(chart, lens, rows, *directions)
-    lost, reach, *rim = (w.unflatten(0, (-1, AZIMUTHS)) for w in followed)
-    pairs = torch.stack((lost, lost.roll(-1, -1)), -1).flatten(0, 1)
-    # for each azimuth and the next, (M, 2), the radius at which the lens is lost
-    ends = _radius_at(rows, pairs)
-    nearer, further = ends.amin(-1), ends.amax(-1)
-    # Between two azimuths the fold moves smoothly, and may bulge: the orientation decides where it lies.
-    # If the fold ends there, the nearer radius is on the safe side.
-    smooth = (pairs.diff(dim=-1).squeeze(-1).abs() <= 1.5) | (further <= (1 + SMOOTH) * nearer)
-    limit = torch.where(smooth, further * (1 + BULGE), nearer).unsqueeze(-1)
-    limits = limit.clamp(max=chart.end(limit.dtype)).squeeze(-1).unflatten(0, (-1, AZIMUTHS))
-    envelope = _envelope(*rim)
+    lost, reach, furthest, x, y = (of_rows.unflatten(0, (-1, AZIMUTHS)) for of_rows in followed)
+    limits = _limits(lost, rows, chart.end(rows.dtype))
+    envelope = _envelope(furthest, x, y)
     return limits * limits, Extent(radii, reach, torch.where(envelope < FAR_IMAGE, envelope, torch.inf))
 
 
 def _follow(chart: Chart, lens: Lens, radii: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
-    """Return on azimuths (M,) the node where a lens is lost, how far it sends radii, the furthest, its last point."""
+    """Follow lenses on azimuths (M,) towards (a, b), at radii (M, S).
+
+    Returns where each is lost, in nodes; how far the lens sends radii up to each (M, S), and the furthest; and its last
+    point (x, y).
+    """
     a, b = a.unsqueeze(-1), b.unsqueeze(-1)
+    end, last = chart.end(radii.dtype), radii.shape[-1] - 1
     at = lens.at(a * radii, b * radii)
     lost = _find_loss(lens, a, b, radii, at.orientation)
-    (x, y), end = at.value, chart.end(radii.dtype)
-    reach = (x * x + y * y).sqrt()
-    index = torch.arange(reach.shape[-1], dtype=reach.dtype, device=reach.device)
-    reach = torch.where((index < lost.unsqueeze(-1)) & (reach < torch.inf), reach, torch.inf).cummax(-1).values
-    nodes = lost.clamp(max=radii.shape[-1] - 1).unsqueeze(-1)
-    last = _radius_at(radii, nodes).clamp(max=end)
-    x, y = lens.at(a * last, b * last, order=0).value
-    before = torch.where((radii < last) & (reach < torch.inf), reach, 0.0).amax(-1, keepdim=True)
+    x, y = at.value
+    distance = (x * x + y * y).sqrt()
+    nodes = torch.arange(last + 1, dtype=radii.dtype, device=radii.device)
+    is_before = (nodes < lost.unsqueeze(-1)) & (distance < torch.inf)
+    reach = torch.where(is_before, distance, torch.inf).cummax(-1).values
+    # the last point, and the furthest one up to there
+    place = lost.clamp(max=last).unsqueeze(-1)
+    rim = _radius_at(radii, place).clamp(max=end)
+    x, y = lens.at(a * rim, b * rim, order=0).value
+    before = torch.where((radii < rim) & (reach < torch.inf), reach, 0.0).amax(-1, keepdim=True)
     furthest = torch.maximum((x * x + y * y).sqrt(), before)
     # before a pole the lens sends points to infinity
-    beyond = radii.gather(-1, nodes.ceil().long()).clamp(max=end)
+    beyond = radii.gather(-1, place.ceil().long()).clamp(max=end)
     margin = lens.at(a * beyond, b * beyond).margin
-    open_ended = furthest.isnan() if margin is None else furthest.isnan() | ~(margin > 0)
-    return lost, reach, torch.where(open_ended, torch.inf, furthest).squeeze(-1), x.squeeze(-1), y.squeeze(-1)
-
-
-class Extent(NamedTuple):
-    """The reach of the lenses of cameras (G,) on their azimuths.
-
-    radii: (G, radii). reach: (G, azimuths, radii), how far from the centre they go, ascending; infinite past the fold.
-    furthest: (G, azimuths), the distance that no point before the fold exceeds in each direction of the image.
-    """
-
-    radii: Tensor
-    reach: Tensor
-    furthest: Tensor
-
-    def start(self, camera: Tensor, target: Tensor, a: Tensor, b: Tensor) -> Tensor:
-        """Return the radius (M,) before the fold at which a point's lens nearly reaches `target` towards (a, b)."""
-        row = camera * AZIMUTHS + azimuth(a, b, 0.5)
-        table = self.reach.flatten()
-        size = self.radii.shape[-1]
-        low = _last_not_above(table, row * size, size, target)
-        near, far = table[row * size + low], table[row * size + low + 1]
-        # next to the fold only its inner side is a safe start
-        fraction = torch.where(far < torch.inf, (target - near) / torch.where(far > near, far - near, 1.0), 0.0)
-        inner, outer = (self.radii.flatten()[camera * size + low + i] for i in range(2))
-        return inner + fraction.clamp(0, 1) * (outer - inner)
-
-
-def _envelope(furthest: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Return (G, azimuths), by direction of the image, from the images (x, y) of the ends of the azimuths."""
-    # a regular map sends its inside inside: no point goes further than the outermost of the rim
-    here = azimuth(x.nan_to_num(0.0, 0.0, 0.0), y.nan_to_num(0.0, 0.0, 0.0)).long()
-    turn = (here.roll(-1, -1) - here + AZIMUTHS // 2).remainder(AZIMUTHS) - AZIMUTHS // 2
-    level = torch.maximum(furthest, furthest.roll(-1, -1))
-    envelope = torch.zeros_like(level)
-    for step in range(-SPAN, SPAN + 1):
-        between = (step >= turn.clamp(max=0) - ASIDE) & (step <= turn.clamp(min=0) + ASIDE)
-        direction = (here + step).remainder(AZIMUTHS)
-        envelope = envelope.scatter_reduce(-1, direction, torch.where(between, level, 0.0), "amax")
-    # the envelope becomes a circle if the rim has no end, turns by leaps, or is not seen to go once around the centre
-    leaps = (level == torch.inf) | (turn.abs() > SPAN - ASIDE) | (turn.sum(-1, keepdim=True) != AZIMUTHS)
-    circle = torch.where(leaps.any(-1, keepdim=True), level.amax(-1, keepdim=True), 0.0)
-    return BEYOND * torch.maximum(envelope, circle)
+    is_endless = furthest.isnan() if margin is None else furthest.isnan() | ~(margin > 0)
+    furthest = torch.where(is_endless, torch.inf, furthest)
+    return lost, reach, furthest.squeeze(-1), x.squeeze(-1), y.squeeze(-1)
 
 
 def _find_loss(lens: Lens, a: Tensor, b: Tensor, radii: Tensor, orientation: Tensor) -> Tensor:
     """Return `first_loss` (M,), but dips between coarse nodes (M, S) count only if a closer look finds them."""
     last = orientation.shape[-1] - 1
     steps = torch.linspace(-1, 1, DIP, dtype=orientation.dtype, device=orientation.device)
-
-    def assumed(lost: Tensor) -> Tensor:
-        node = lost.round().long().clamp(max=last).unsqueeze(-1)
-        return (lost <= last).unsqueeze(-1) & (orientation.gather(-1, node) > 0)
-
     spared = torch.zeros_like(orientation, dtype=torch.bool)
-    lost = first_loss(orientation, spared)
-    dips = assumed(lost)
-    while bool(dips.any()):
-        node = lost.round().long().clamp(max=last).unsqueeze(-1)
-        radius = _radius_at(radii, (node + steps).clamp(0, last))
-        spared_now = dips & (lens.at(a * radius, b * radius).orientation > 0).all(-1, keepdim=True)
-        spared = spared.scatter(-1, node, spared.gather(-1, node) | spared_now)
+    is_open: Tensor | None = None  # whether an earlier look has spared a dip of the row, so that it goes on
+    while True:
         lost = first_loss(orientation, spared)
-        dips = assumed(lost) & spared_now  # in rows that are not done
-    return lost
+        node = lost.round().long().clamp(max=last).unsqueeze(-1)
+        is_dip = (lost <= last).unsqueeze(-1) & (orientation.gather(-1, node) > 0)
+        is_dip = is_dip if is_open is None else is_dip & is_open
+        if not bool(is_dip.any()):
+            return lost
+        radius = _radius_at(radii, (node + steps).clamp(0, last))
+        is_open = is_dip & (lens.at(a * radius, b * radius).orientation > 0).all(-1, keepdim=True)
+        spared = spared.scatter(-1, node, spared.gather(-1, node) | is_open)
+
+
+def _limits(lost: Tensor, radii: Tensor, end: float | Tensor) -> Tensor:
+    """Return the radii (C, azimuths), from each azimuth to the next, before which the orientation decides.
+
+    Between two azimuths the fold mostly moves smoothly, and may bulge: the orientation decides where it lies. If the
+    fold ends there, the nearer radius is on the safe side.
+    """
+    places = torch.stack((lost, lost.roll(-1, -1)), -1).flatten(0, 1)  # on an azimuth and the next, (M, 2)
+    folds = _radius_at(radii, places)
+    nearer, further = folds.amin(-1), folds.amax(-1)
+    is_smooth = (places.diff(dim=-1).squeeze(-1).abs() <= 1.5) | (further <= (1 + SMOOTH) * nearer)
+    limits = torch.where(is_smooth, further * (1 + BULGE), nearer).unsqueeze(-1)
+    limits = limits.clamp(max=end)  # (M, 1), as the end may be
+    return limits.view(-1, AZIMUTHS)
+
+
+def _envelope(furthest: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Return the furthest distances (C, azimuths) by direction of the image, from the images (x, y) of the rim.
+
+    A regular map sends its inside inside: no point goes further than the outermost of the rim.
+    """
+    # the directions that the rim passes from each azimuth to the next, and how far out it is there
+    here = azimuth(x.nan_to_num(0.0, 0.0, 0.0), y.nan_to_num(0.0, 0.0, 0.0)).long()
+    turn = (here.roll(-1, -1) - here + AZIMUTHS // 2).remainder(AZIMUTHS) - AZIMUTHS // 2
+    level = torch.maximum(furthest, furthest.roll(-1, -1))
+    envelope = torch.zeros_like(level)
+    for step in range(-SPAN, SPAN + 1):
+        is_passed = (step >= turn.clamp(max=0) - ASIDE) & (step <= turn.clamp(min=0) + ASIDE)
+        direction = (here + step).remainder(AZIMUTHS)
+        envelope = envelope.scatter_reduce(-1, direction, torch.where(is_passed, level, 0.0), "amax")
+    # the envelope becomes a circle if the rim has no end, turns by leaps, or is not seen to go once around the centre
+    leaps = (level == torch.inf) | (turn.abs() > SPAN - ASIDE) | (turn.sum(-1, keepdim=True) != AZIMUTHS)
+    circle = torch.where(leaps.any(-1, keepdim=True), level.amax(-1, keepdim=True), 0.0)
+    return BEYOND * torch.maximum(envelope, circle)
 
 
 def _directions(like: Tensor) -> tuple[Tensor, Tensor]:
@@ -152,7 +168,7 @@ def azimuth(a: Tensor, b: Tensor, offset: float = 0.0) -> Tensor:
 def _last_not_above(table: Tensor, row: Tensor, length: int, target: Tensor) -> Tensor:
     """Return the index, up to length - 2, of the last entry not above `target` in the ascending row from `row` on."""
     low, high = torch.zeros_like(row), torch.full_like(row, length - 1)
-    for _ in range((length - 1).bit_length()):
+    for _ in range((length - 1).bit_length()):  # by bisection
         middle = (low + high) // 2
         above = table[row + middle] > target
         low, high = torch.where(above, low, middle), torch.where(above, middle, high)
@@ -160,22 +176,26 @@ def _last_not_above(table: Tensor, row: Tensor, length: int, target: Tensor) -> 
 
 
 def _around(radial: RadialFactor | None, chart: Chart, fine: Tensor) -> Tensor:
-    """Return radii (C, radii): the chart's, and more of them close to the fold of the radial factor, if it has one."""
+    """Return radii (C, radii): the chart's, and more of them close to the fold of the radial factor, if it has one.
+
+    `fine` are radii (S,) of the chart, at which that fold is looked for.
+    """
     if radial is None:
         return chart.radii(RADII, fine)
     orientation = radial.orientation(fine)
     fold = _radius_at(fine.expand_as(orientation), first_loss(orientation).unsqueeze(-1))
     # without a fold on the chart, the middle of the chart does no harm
     fold = torch.where(fold < torch.inf, fold, 1.0)
+    # from half of it to one and a half, denser the closer to it
     spread = 1 + 0.5 * torch.linspace(-1, 1, RADII // 2, dtype=fine.dtype, device=fine.device) ** 3
     close = (fold * spread).clamp(max=fine[-1])
-    coarse = chart.radii(RADII // 2, fine).expand(*close.shape[:-1], -1)
-    return torch.cat((coarse, close), -1).sort(-1).values
+    even = chart.radii(RADII // 2, fine).expand(*close.shape[:-1], -1)
+    return torch.cat((even, close), -1).sort(-1).values
 
 
-def _radius_at(radii: Tensor, position: Tensor) -> Tensor:
-    """Return the radii (M, P) at fractional node positions (M, P) of radii (M, S); infinite from S on."""
+def _radius_at(radii: Tensor, place: Tensor) -> Tensor:
+    """Return the radii (M, P) at places (M, P), on or between the nodes of radii (M, S); infinite from S on."""
     last = radii.shape[-1] - 1
-    index = position.floor().long().clamp(max=last)
-    inner, outer = radii.gather(-1, index), radii.gather(-1, (index + 1).clamp(max=last))
-    return torch.where(position <= last, inner + (position - index) * (outer - inner), torch.inf)
+    node = place.floor().long().clamp(max=last)
+    inner, outer = radii.gather(-1, node), radii.gather(-1, (node + 1).clamp(max=last))
+    return torch.where(place <= last, inner + (place - node) * (outer - inner), torch.inf)
