@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any
 
@@ -34,16 +34,18 @@ def on_cpu(*tensors: Tensor, may_wait: bool = False) -> list[Tensor] | None:
         return None
     pairs = [_known.get(_key(t)) for t in tensors]
     unknown = [t.detach() for t, pair in zip(tensors, pairs, strict=True) if pair is None]
-    read: Iterator[Tensor] = iter(())
-    if unknown and may_wait:
+    if unknown and not may_wait:
+        return None
+    values = [pair[1] for pair in pairs if pair is not None]
+    if unknown:
         with outside_inference():
             numbers = torch.cat([t.reshape(-1).view(torch.uint8) for t in unknown]).cpu()
-        parts = numbers.split([t.nbytes for t in unknown])
-        values = (part.clone().view(t.dtype).view(t.shape) for t, part in zip(unknown, parts, strict=True))
-        read = map(remember, unknown, values)
-    elif unknown:
-        return None
-    return [(next(read) if pair is None else pair[1]).view(t.shape) for t, pair in zip(tensors, pairs, strict=True)]
+        parts = iter(numbers.split([t.nbytes for t in unknown]))
+        values = [
+            remember(t, next(parts).clone().view(t.dtype)) if pair is None else pair[1]
+            for t, pair in zip(tensors, pairs, strict=True)
+        ]
+    return [value.view(t.shape) for t, value in zip(tensors, values, strict=True)]
 
 
 def remember(tensor: Tensor, values: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.door import has_tangent, in_graph, in_transform, is_concrete, is_eager, outside_inference
+from camtorch.evaluate.door import has_tangent, in_transform, is_concrete, is_eager, outside_inference
 
 T = TypeVar("T")
 
@@ -38,9 +38,11 @@ class Kept:
 
     def __call__(self, inputs: Sequence[Tensor], key: tuple[Any, ...], compute: Callable[[], T]) -> T:
         """Return `compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `key`."""
-        if inputs and not is_eager(*inputs) and not all(is_concrete(t) and not has_tangent(t) for t in inputs):
+        may_read = not inputs or is_eager(*inputs) or all(is_concrete(t) and not has_tangent(t) for t in inputs)
+        if not may_read:
             return compute()
-        if (entry := self.entry(inputs, key)) is not None:
+        entry = self.entry(inputs, key)
+        if entry is not None:
             found: T = entry.result
             self.result = found
             return found
@@ -74,14 +76,6 @@ class Kept:
         with outside_inference():
             self.result = result = compute()
         return result
-
-    def copies(
-        self, inputs: Sequence[Tensor], key: tuple[Any, ...], compute: Callable[[], tuple[Tensor, ...]]
-    ) -> tuple[Tensor, ...]:
-        """Return tensors that belong to the caller: copies of those kept, or new ones if an input learns."""
-        if torch.is_grad_enabled() and any(map(in_graph, inputs)):
-            return compute()
-        return tuple(t.clone() for t in self(inputs, key, compute))
 
     def __getstate__(self) -> dict[str, Any]:
         return {"capacity": self.capacity}

@@ -200,17 +200,18 @@ class PlanarAt(StageAt):
 
     @property
     def value(self) -> Planes2:
-        stage = self.stage
-        value = [self.a * self.factor, self.b * self.factor] if stage.radial else [self.a, self.b]
-        for i, m in enumerate((self.a, self.b)):
-            even: Any = stage.tangential[i] if stage.tangential else 0
-            if stage.tangential:
-                value[i] = torch.addcmul(value[i], m, self.twice_dot)
-            if stage.prism:
-                even = (even + stage.prism[2 * i]) + stage.prism[2 * i + 1] * self.t
-            if stage.tangential or stage.prism:
-                value[i] = torch.addcmul(value[i], even, self.t)
-        return value[0], value[1]
+        stage, a, b, t = self.stage, self.a, self.b, self.t
+        u, v = (a * self.factor, b * self.factor) if stage.radial else (a, b)
+        even: Sequence[Any] = (0, 0)  # the factors of t
+        if stage.tangential:
+            u, v = torch.addcmul(u, a, self.twice_dot), torch.addcmul(v, b, self.twice_dot)
+            even = stage.tangential
+        if stage.prism:
+            s0, s1, s2, s3 = stage.prism
+            even = (even[0] + s0) + s1 * t, (even[1] + s2) + s3 * t
+        if stage.tangential or stage.prism:
+            u, v = torch.addcmul(u, even[0], t), torch.addcmul(v, even[1], t)
+        return u, v
 
     @property
     def jacobian(self) -> Jacobian:

@@ -182,7 +182,8 @@ class Domain:
             return inside
         if may_branch_on(inside):  # few points are as far out
             places = (~(inside > 0)).nonzero(as_tuple=True)
-            if len(camera := places[0]):
+            camera, _ = places
+            if len(camera):
                 a, b = a[places], b[places]
                 before = self.limits2[camera, azimuth(a, b)] - t[places]
                 outside = torch.minimum(before, regular(self.optics_of(camera)[1], a, b))

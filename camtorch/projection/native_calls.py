@@ -139,54 +139,64 @@ class Lattices:
         move: structs.Move | None = None,
         room: Callable[[int], Tensor] = lambda count: torch.empty(count, dtype=torch.uint8, device="cpu"),
     ):
-        dtype, count, is_double = probes.dtype, probes.shape[1], probes.dtype == torch.float64
-        n, m = -(-size[0] // structs.STEP), -(-size[1] // structs.STEP)
-        nodes, self._most = (n + 5) * (m + 5), cameras * n * m
-        # the first (n + 5) (m + 5) nodes are those of the lattice, the others are on the rim
+        n, m = -(-size[0] // structs.STEP), -(-size[1] // structs.STEP)  # rows and columns of cells
+        dtype, count = probes.dtype, probes.shape[1]
+        nodes = (n + 5) * (m + 5)  # the first probes; the others are on the rim
+        self._is_double, self._most = dtype == torch.float64, cameras * n * m
         self.nodes = torch.empty(cameras, 2, count, dtype=dtype, device="cpu")
         self.cells = torch.empty(cameras, n, m, dtype=torch.int32, device="cpu")
         # exact positions, of which parts are written; nodes in float32; scratch; valid flags of the probes
-        squares = 2 * structs.SQUARES * self._most
-        sizes = squares * dtype.itemsize, 8 * cameras * nodes * is_double, 4 * structs.SCRATCH * cameras * (m + 8)
-        self._room, self.counters = room(sum(sizes) + cameras * count), (c_int64 * 2)()
+        sizes = (
+            2 * structs.SQUARES * self._most * dtype.itemsize,
+            8 * cameras * nodes * self._is_double,
+            4 * structs.SCRATCH * cameras * (m + 8),
+        )
+        self._room = room(sum(sizes) + cameras * count)
         exact, narrow, scratch, valid = accumulate(sizes, initial=self._room.data_ptr())
-        made, next_camera = structs.Lattices(), addressof(self.counters)
+        self.counters = (c_int64 * 2)()  # the next camera, and how many places of `exact` are used
+        next_camera = addressof(self.counters)
+        made = self.struct = structs.Lattices(first_row=first_row, exact=exact, used=next_camera + 8)
         made.hold(probes)
-        made.first_row, made.narrow, made.exact = first_row, narrow if is_double else None, exact
-        made.used = next_camera + 8
+        if self._is_double:
+            made.narrow = narrow
+        # where the source sees the probes
         if move is None:
             made.move.turn_strides[:] = 0, 1, 3
         else:
             made.move = move
-        move, cells = made.move, made.cells
+        move = made.move
         move.cameras, move.form, (move.height, move.width) = cameras, structs.POSITIONS, source_size
         move.rows, move.row_strides[:] = address_and_strides(probes)
         move.results, move.result_strides[:], move.valid = self.nodes.data_ptr(), (2 * count, 1, count), valid
         move.count, move.tile, move.next = count, count, next_camera
+        # the kinds of the cells between them
+        cells = made.cells
         cells.nodes, cells.node_strides[:] = move.results, (2 * count, count)
-        cells.mapped, cells.rim, cells.cells, cells.scratch = valid, valid + nodes, self.cells.data_ptr(), scratch
-        cells.mapped_stride, cells.rim_stride, cells.count, cells.rows, cells.columns = count, count, cameras, n, m
+        cells.mapped, cells.mapped_stride, cells.rim, cells.rim_stride = valid, count, valid + nodes, count
+        cells.cells, cells.count, cells.rows, cells.columns = self.cells.data_ptr(), cameras, n, m
         (cells.height, cells.width), (cells.source_height, cells.source_width) = size, source_size
-        cells.tolerance, cells.padding = tolerance, PADDING_CODES[padding]
-        self.struct, self._is_double = made, is_double
+        cells.tolerance, cells.padding, cells.scratch = tolerance, PADDING_CODES[padding], scratch
 
     def lay(self, job: structs.Job) -> None:
         """Have a job sample by these lattices, whose nodes are then in float32."""
-        made, double, (_, n, m) = self.struct, self._is_double, self.cells.shape
-        plane = (n + 5) * (m + 5)
-        job.nodes = made.narrow if double else made.cells.nodes
-        job.node_strides[:] = (2 * plane, plane) if double else tuple(made.cells.node_strides)
+        made, (_, n, m) = self.struct, self.cells.shape
+        if self._is_double:
+            plane = (n + 5) * (m + 5)
+            job.nodes, job.node_strides[:] = made.narrow, (2 * plane, plane)
+        else:
+            job.nodes, job.node_strides[:] = made.cells.nodes, tuple(made.cells.node_strides)
         job.cells, job.cell_stride, job.rows, job.columns = made.cells.cells, n * m, n, m
-        job.exact, job.exact_stride = made.exact, structs.SQUARES * self._most * (1 + double)
+        job.exact, job.exact_stride = made.exact, structs.SQUARES * self._most * (1 + self._is_double)
 
     def results(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return `nodes` (C, 2, n + 5, m + 5), `cells`, and `exact` (2, K, 8, 8), NaN if there is no position."""
-        (cameras, n, m), dtype, most, step = self.cells.shape, self.nodes.dtype, self._most, structs.STEP
+        cameras, n, m = self.cells.shape
         nodes = self.nodes.as_strided((cameras, 2, n + 5, m + 5), (*self.nodes.stride()[:2], m + 5, 1))
-        if not self.counters[1]:
+        used, step = self.counters[1], structs.STEP
+        if not used:
             return nodes, self.cells, nodes.new_empty(2, 0, step, step)
-        exact = self._room[: 2 * step * step * most * dtype.itemsize].view(dtype).view(2, most, step, step)
-        return nodes, self.cells, exact[:, : self.counters[1]].clone()
+        exact = self._room[: 2 * step * step * self._most * nodes.dtype.itemsize].view(nodes.dtype)
+        return nodes, self.cells, exact.view(2, self._most, step, step)[:, :used].clone()
 
 
 class NativeMove:

@@ -18,6 +18,7 @@ from camtorch.values.arguments import columns
 if TYPE_CHECKING:
     from camtorch.optics.charts import Chart
 
+_AXIS = 0.0, 0.0, 1.0
 INVALID_PIXEL = -1.0  # outside every image, so that `contains` is False for it as well
 
 
@@ -27,20 +28,22 @@ def _normalise(chart: Chart, x: Tensor, y: Tensor, z: Tensor, looks: bool) -> tu
     size = torch.maximum(torch.maximum(x_0.abs(), y_0.abs()), z_0.abs())
     # NaN fails both comparisons; closer to the origin the derivative leaves the floating-point range
     least = floor_of(size.dtype)
-    ends = size.aminmax() if looks else None
-    is_valid = ends is not None and bool(ends[0] > least) and bool(ends[1] < torch.inf)
-    valid = None if is_valid else ((size > least) & (size < torch.inf)).to(size.dtype)
+    are_finite = False
+    if looks:
+        smallest, largest = size.aminmax()
+        are_finite = bool(smallest > least) and bool(largest < torch.inf)
+    finite = None if are_finite else ((size > least) & (size < torch.inf)).to(size.dtype)
     # the factor is a constant: the projection does not depend on the distance, which has no part in the derivative
-    shrink = as_kept(power_of_two(replace(valid, size, 1.0)).reciprocal())
+    shrink = as_kept(power_of_two(replace(finite, size, 1.0)).reciprocal())
 
     def shrunk(*ray: Tensor) -> list[Tensor]:
-        return [replace(valid, w, axis) * shrink for w, axis in zip(ray, (0.0, 0.0, 1.0), strict=True)]
+        return [replace(finite, w, axis) * shrink for w, axis in zip(ray, _AXIS, strict=True)]
 
     rays = shrunk(x, y, z)
     margin = chart.margin(*([w.detach() for w in rays] if looks else shrunk(x_0, y_0, z_0)))
-    mask = both(valid, to_mask(margin, looks))
+    mask = both(finite, to_mask(margin, looks))
     mask = None if mask is None else as_kept(mask)
-    x, y, z = (replace(mask, w, axis) for w, axis in zip(rays, (0.0, 0.0, 1.0), strict=True))
+    x, y, z = (replace(mask, w, axis) for w, axis in zip(rays, _AXIS, strict=True))
     return (x, y, z), mask
 
 

@@ -96,7 +96,9 @@ def _invert_radial(domain: Domain, u: Tensor, v: Tensor) -> Found:
 
 
 def _newton(lens: Lens, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Found:
-    short2, converged, looks = short(u.dtype) ** 2, None, may_branch_on(u)
+    """Return the solutions of lens(a, b) = (u, v) that Newton's method reaches from (a, b)."""
+    short2, looks = short(u.dtype) ** 2, may_branch_on(u)
+    converged: Tensor | None = None
     for _ in range(MOST_STEPS):
         at = lens.at(a, b)
         x, y = at.value
@@ -147,9 +149,25 @@ def _to_target(u: Tensor, v: Tensor, intrinsics: tuple[Tensor, ...], looks: bool
     p, q = (u - centre_x) / focal_x, (v - centre_y) / focal_y
     far = torch.maximum(p.detach().abs(), q.detach().abs())
     mask = to_mask(torch.finfo(far.dtype).max ** 0.25 - far, looks)
-    if mask is not None:
-        p, q = ((torch.where(mask > 0, w, c) - c) / f for w, c, f in ((u, centre_x, focal_x), (v, centre_y, focal_y)))
+    if mask is not None:  # pixels themselves are replaced: derivatives would keep a NaN
+        u, v = replace(mask, u, centre_x), replace(mask, v, centre_y)
+        p, q = (u - centre_x) / focal_x, (v - centre_y) / focal_y
     return (p, q), mask
+
+
+def _solve(model: type[CameraLike], domain: Domain, p: Tensor, q: Tensor, looks: bool) -> tuple[Tensor, ...]:
+    """Return points of the chart's plane that the lens sends to (p, q), and a margin, positive where they do."""
+    if not domain.lens.stages:
+        return p, q, domain.chart.on_plane(p, q)
+    found = invert(domain, p, q)
+    if domain.is_constant:
+        found = _search_recorded(domain, (p, q), found)
+    elif torch.compiler.is_compiling():
+        search_in_place(model.operator_name, domain.k, p, q, *found)
+    elif not (looks and bool(found.solved.amin() > 0)):
+        a, b, solved = search_open(model.operator_name, domain.k, p, q, *found)
+        return a, b, solved
+    return found[:3]
 
 
 def _formula(
@@ -167,19 +185,7 @@ def _formula(
     # the solution has no graph; `attach` gives it derivatives
     (p, q), mask = _to_target(u.detach(), v.detach(), columns(traced.intrinsics.detach()), looks)
     mask = both(mask, traced.usable)
-    p, q = replace(mask, p, 0.0), replace(mask, q, 0.0)
-    if domain.lens.stages:
-        found = invert(domain, p, q)
-        if domain.is_constant:
-            found = _search_recorded(domain, (p, q), found)
-        elif torch.compiler.is_compiling():
-            search_in_place(model.operator_name, domain.k, p, q, *found)
-        elif not (looks and bool(found.solved.amin() > 0)):
-            a, b, solved = search_open(model.operator_name, domain.k, p, q, *found)
-            found = Found(a, b, solved, found.possible)
-        a, b, margin = found.a, found.b, found.solved
-    else:
-        a, b, margin = p, q, domain.chart.on_plane(p, q)
+    a, b, margin = _solve(model, domain, replace(mask, p, 0.0), replace(mask, q, 0.0), looks)
     solved = to_mask(margin, looks)
     seen = domain.chart.seen(replace(solved, a, 0.0), replace(solved, b, 0.0))
     solved = solved if seen is None else both(solved, to_mask(seen, looks))

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from camtorch.evaluate.door import in_graph
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import is_unknown, known_false
 from camtorch.poses.extrinsics import Extrinsics
@@ -66,7 +67,10 @@ def over_image(
     step = max(as_whole(stride, "stride", "pixel_grid"), 1)
     if math.prod((*camera.batch_shape, *camera.size_for("pixel_grid"))) // step**2 > _MOST_KEPT_RAYS:
         return compute()
-    return memo.copies(inputs, (camera.form, stride), compute)
+    if torch.is_grad_enabled() and any(map(in_graph, inputs)):
+        return compute()
+    # copies, as the caller may write into them
+    return tuple(t.clone() for t in memo(inputs, (camera.form, stride), compute))
 
 
 def plucker(rays: Tensor, valid: Tensor, extrinsics: Extrinsics | None, owner: str) -> tuple[Tensor, Tensor]:

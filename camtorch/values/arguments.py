@@ -50,7 +50,8 @@ def hinting(hint: str) -> Callable[[Callable[Taken, Result]], Callable[Taken, Re
             try:
                 return function(*args, **kwargs)
             except TypeError as error:
-                if name := next((name for name in kwargs if f"unexpected keyword argument {name!r}" in str(error)), ""):
+                name = next((name for name in kwargs if f"unexpected keyword argument {name!r}" in str(error)), "")
+                if name:
                     close = difflib.get_close_matches(name, inspect.signature(function).parameters, 1, CLOSE)
                     meant = f"Did you mean {close[0]!r}? " if close else ""
                     unknown = f"{function.__qualname__}() got an unexpected keyword argument {name!r}"

@@ -235,7 +235,8 @@ class BatchedModule(GeometryModule):
         return True
 
     def _needed_batch(self, what: str) -> torch.Size:
-        if not (batch := self.batch_shape):
+        batch = self.batch_shape
+        if not batch:
             raise TypeError(f"{type(self).__name__}: it must have batch dims to be {what}; got a single one")
         return batch
 
@@ -319,12 +320,15 @@ def remade(module: Made, learns: bool = False, /, **changes: Any) -> Made:
         for name, tensor in tensors.items():
             if not tensor.shape[-1]:
                 made.put(name, tensor.detach() if tensor.requires_grad else tensor)
-            elif type(tensor) is nn.Parameter or is_parameter(tensor := fixed(tensor)):  # most are one
-                parameters[name] = untraced[name] = tensor
+                continue
+            its = tensor if type(tensor) is nn.Parameter else fixed(tensor)  # most are one
+            if type(its) is nn.Parameter or is_parameter(its):
+                parameters[name] = untraced[name] = its
             else:
-                made.put(name, _widen(tensor))
+                made.put(name, _widen(its))
     for name in module.tensor_names if learns else ():
-        if isinstance(its := getattr(made, name), nn.Parameter):
+        its = getattr(made, name)
+        if isinstance(its, nn.Parameter):
             its.requires_grad_(getattr(module, name).requires_grad)
     return made
 
