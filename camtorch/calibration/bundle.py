@@ -6,6 +6,7 @@ complement does, without the squares of normal equations.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from camtorch.calibration.robust import LEAST_SQUARES, Loss
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import fixed_camera
 from camtorch.convert.fitting import bounds
-from camtorch.least_squares.equations import Equations, System, padded, places_of, triangle_of_few
+from camtorch.least_squares.equations import Equations, System, padded, triangle_of_few
 from camtorch.least_squares.jacobians import sensor_jacobians
 from camtorch.least_squares.levenberg_marquardt import FIRST_DAMPING, minimise, rounding_of
 from camtorch.native.structs import LOST
@@ -235,28 +236,27 @@ class Bundle:
             remade(camera, intrinsics=p[0, :4], distortion=p[0, 4:]) if len(p) == 1 and not bool(f.any()) else None
             for camera, p, f in zip(self.cameras, state.parameters, free.parameters, strict=True)
         ]
-        counts = [p.shape[-1] for p in state.parameters]
-        columns = [(c, i) for c, f in enumerate(free.parameters) for i in f.nonzero()[:, 0].tolist()]
-        if free.mounts:
-            columns += [(c, count + i) for c, count in enumerate(counts) if c > 0 for i in range(6)]
-        if free.bend:
-            columns += [(-1, 0), (-1, 1)]
-        self.columns = tuple(columns)
-        # for each camera, the places of its parameters among the columns, and their indices; the places of its mount
-        self.learnt = [places_of(self.columns, c, range(count)) for c, count in enumerate(counts)]
-        self.mounted = [places_of(self.columns, c, range(count, count + 6))[0] for c, count in enumerate(counts)]
+        # for each camera, the places of its parameters among the shared unknowns, and their indices; those of its mount
+        places = itertools.count()
+        indices = [f.nonzero()[:, 0].tolist() for f in free.parameters]
+        self.learnt = [(list(itertools.islice(places, len(own))), own) for own in indices]
+        mounted = [6 if free.mounts and c > 0 else 0 for c in range(len(observed))]
+        self.mounted = [list(itertools.islice(places, number)) for number in mounted]
+        self.bent = list(itertools.islice(places, 2 if free.bend else 0))
+        self.shared_width = next(places)  # the number of shared unknowns
         self.is_bent = free.bend or bool((state.bend != 0).any())
         # native code knows one camera that sees flat boards at unknown poses
         is_plain = len(observed) == 1 and free.boards == "poses" and not self.is_bent
         self.is_compiled = is_plain and native_forms(self.cameras, self.observed[0].pixels) is not None
         self.width = 6 if free.boards == "poses" else 3  # of the unknowns of a view
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.observed]).any(0).sum()
-        self.unknowns = len(self.columns) + self.width * int(views)
+        self.unknowns = self.shared_width + self.width * int(views)
         ends = [bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)]
-        self.low = self._of_columns([low for low, _ in ends], -torch.inf)
-        self.high = self._of_columns([high for _, high in ends], torch.inf)
+        self.low = self._of_shared([low for low, _ in ends], -torch.inf)
+        self.high = self._of_shared([high for _, high in ends], torch.inf)
         # the bound of a focal length only catches failures
-        self.is_bounded = any(c >= 0 and i >= 4 and self.cameras[c].fit_bounds for c, i in self.columns)
+        learning = zip(self.cameras, indices, strict=True)
+        self.is_bounded = any(camera.fit_bounds and max(own, default=0) >= 4 for camera, own in learning)
 
     def flat(self, state: State) -> tuple[Tensor, ...]:
         """Return the state as tensors (B, ...)."""
@@ -266,9 +266,9 @@ class Bundle:
     def state(self, flat: Sequence[Tensor]) -> State:
         return State(tuple(flat[5:]), Poses(*flat[2:4]), Poses(*flat[:2]), flat[4])
 
-    def _of_columns(self, parameters: Sequence[Tensor], other: float) -> Tensor:
+    def _of_shared(self, parameters: Sequence[Tensor], other: float) -> Tensor:
         """Return the value of each shared unknown (B, G) in `parameters`, or `other` for mounts and bends."""
-        found = parameters[0].new_full((max(map(len, parameters)), len(self.columns)), other)
+        found = parameters[0].new_full((max(map(len, parameters)), self.shared_width), other)
         for (places, own), values in zip(self.learnt, parameters, strict=True):
             found[:, places] = values[:, own]
         return found
@@ -341,12 +341,12 @@ class Bundle:
 
     def linearised(self, flat: Sequence[Tensor], rows: Tensor) -> System:
         equations = self.equations(flat, rows)
-        held = torch.zeros(len(rows), len(self.columns), dtype=torch.bool, device=flat[1].device)
+        held = torch.zeros(len(rows), self.shared_width, dtype=torch.bool, device=flat[1].device)
         if self.is_bounded:
             # parameters that would leave their bounds stay there, so that the others can move on
             view, shared = equations.view[..., self.width :], equations.shared
             slope = (view[..., :-1] * view[..., -1:]).sum((1, 2)) + (shared[..., :-1] * shared[..., -1:]).sum(1)
-            values, low, high = self._of_columns(flat[5:], 0.0), _of_rows(self.low, rows), _of_rows(self.high, rows)
+            values, low, high = self._of_shared(flat[5:], 0.0), _of_rows(self.low, rows), _of_rows(self.high, rows)
             held = (values <= low) & (slope > 0) | (values >= high) & (slope < 0)
         return System(equations, self.width, held)
 
@@ -358,8 +358,8 @@ class Bundle:
             if self.observed[0].prior:
                 whole = torch.cat((shared, *self._rows_of_priors(state)), -2)
                 shared = torch.linalg.qr(padded(whole), mode="r").R
-            return Equations(view, shared, self.columns)
-        width, total, parts = self.width, len(self.columns), []
+            return Equations(view, shared)
+        width, total, parts = self.width, self.shared_width, []
         for c, errors in enumerate(by_camera):
             block, at = self.rows_of(c, errors, state, rows)
             if total and len(self.observed) > 1:  # a triangle has fewer rows to spread over the columns of all cameras
@@ -370,11 +370,11 @@ class Bundle:
             parts.append(block)
         block = torch.cat(parts, -2)
         if total == 0:  # at most six columns, for which squares are accurate enough
-            return Equations(triangle_of_few(block), block.new_zeros(len(block), 1, 1), ())
+            return Equations(triangle_of_few(block), block.new_zeros(len(block), 1, 1))
         triangle = torch.linalg.qr(padded(block), mode="r").R
         left = torch.cat((triangle[..., width:, width:].flatten(1, 2), *self._rows_of_priors(state)), -2)
         shared = torch.linalg.qr(padded(left), mode="r").R
-        return Equations(triangle[..., :width, :], shared, self.columns)
+        return Equations(triangle[..., :width, :], shared)
 
     def _rows_of_priors(self, state: State) -> list[Tensor]:
         """Return the rows (B, R, G + 1) of each prior."""
@@ -382,7 +382,7 @@ class Bundle:
         for c, (one, parameters) in enumerate(zip(self.observed, state.parameters, strict=True)):
             if one.prior:
                 centre, root = one.prior
-                rows = root.new_zeros(len(parameters), len(root), len(self.columns) + 1)
+                rows = root.new_zeros(len(parameters), len(root), self.shared_width + 1)
                 places, own = self.learnt[c]
                 rows[..., places] = root[:, own]
                 rows[..., -1] = (parameters - centre) @ root.mT
@@ -408,13 +408,12 @@ class Bundle:
         if self.mounted[c]:
             turned = first @ state.mounts.rotations[:, c, None].mT
             columns += [torch.linalg.cross(turned[..., None, :].expand_as(by_point), by_point, dim=-1), by_point]
-        bend, _ = places_of(self.columns, -1, range(2))
-        if bend:
+        if self.bent:
             along = by_first @ state.boards.rotations[:, :, None, :, 2:]
             columns.append(along * bend_points(observed.points, state.bend)[1][..., None, :])
         columns.append(errors.residuals[..., None])
         weighted = torch.cat(columns, -1) * errors.weights.sqrt()[..., None, None]
-        return weighted.flatten(2, 3), [*places, *self.mounted[c], *bend]
+        return weighted.flatten(2, 3), [*places, *self.mounted[c], *self.bent]
 
     def moved(self, flat: Sequence[Tensor], step: Sequence[Tensor], rows: Tensor) -> tuple[Tensor, ...]:
         """Return the state after steps of the views' unknowns (R, V, L) and the shared ones (R, G)."""

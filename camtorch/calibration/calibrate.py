@@ -18,7 +18,6 @@ from camtorch.calibration.start import Lens, as_seen, other_cameras, other_poses
 from camtorch.calibration.uncertainty import shared_factor, spread
 from camtorch.calibration.verdict import Calibration, check_determined
 from camtorch.cameras.camera import Camera
-from camtorch.least_squares.equations import places_of
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_vector
 from camtorch.values.arguments import as_flag, hinting, warn
@@ -234,13 +233,12 @@ def extrinsics_of(boards: Poses, middle: Tensor) -> Extrinsics:
 
 def unknowns(observed: Sequence[CameraObservations], adjusted: Adjusted, views: int) -> float:
     """Return the number of unknowns that the residuals determine: those that learn, less the priors' share."""
-    equations = adjusted.equations
-    by_priors = 0.0
+    factor, by_priors = shared_factor(adjusted.equations), 0.0
     for c, one in enumerate(observed):
         if one.prior:
-            places, own = places_of(equations.columns, c, range(len(one.prior.centre)))
-            by_priors += float((one.prior.root[:, own] @ shared_factor(equations)[0, places]).square().sum())
-    return len(equations.columns) + 6 * views - by_priors
+            places, own = adjusted.problem.learnt[c]
+            by_priors += float((one.prior.root[:, own] @ factor[0, places]).square().sum())
+    return adjusted.problem.shared_width + 6 * views - by_priors
 
 
 def rms_of(residuals: Tensor, seen: Tensor) -> float:

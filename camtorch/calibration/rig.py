@@ -19,7 +19,6 @@ from camtorch.calibration.uncertainty import shared_factor
 from camtorch.calibration.verdict import Calibration
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.rig import Rig
-from camtorch.least_squares.equations import places_of
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_vector
 from camtorch.values.arguments import as_flag, hinting, warn
@@ -149,20 +148,17 @@ def calibrate_rig(
     adjusted = adjust(observed, _join_starts(searches, observed, free), free, loss=robust, steps=STEPS)
     found, noise = results(searches, adjusted, free)
     adjusted = found[0].adjusted  # of all cameras
-    state, equations = adjusted.state, adjusted.equations
-    std = torch.linalg.vector_norm(shared_factor(equations)[0] * noise, dim=-1)
+    std = torch.linalg.vector_norm(shared_factor(adjusted.equations)[0] * noise, dim=-1)
     mounts, mount_std = {}, {}
-    for c, (name, rotation, shift) in enumerate(zip(by_name, *(t[0] for t in state.mounts), strict=True)):
-        mounts[name], mount_std[name] = Extrinsics(rotation_vector(rotation).unsqueeze(-1), shift), std.new_zeros(6)
-        first = state.parameters[c].shape[-1]
-        places, _ = places_of(equations.columns, c, range(first, first + 6))
-        if places:
-            mount_std[name] = std[places]
+    posed = zip(by_name, *(t[0] for t in adjusted.state.mounts), adjusted.problem.mounted, strict=True)
+    for name, rotation, shift, places in posed:
+        mounts[name] = Extrinsics(rotation_vector(rotation).unsqueeze(-1), shift)
+        mount_std[name] = std[places] if places else std.new_zeros(6)
     cameras = dict(zip(by_name, found, strict=True))
     residuals, seen = torch.cat([r[0] for r in adjusted.residuals]), torch.cat([one.seen for one in by_name.values()])
     result = RigCalibration(
         rig=Rig({name: c.camera for name, c in cameras.items()}, mounts),
-        boards=extrinsics_of(state.boards, middle),
+        boards=extrinsics_of(adjusted.state.boards, middle),
         rms=rms_of(residuals, seen),
         sigma=found[0].sigma,
         cameras=cameras,

@@ -11,7 +11,7 @@ from torch import Tensor
 from camtorch.calibration.bundle import Adjusted, pixel_jacobians
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import fixed_camera
-from camtorch.least_squares.equations import Equations, places_of
+from camtorch.least_squares.equations import Equations
 from camtorch.poses.rotations import skew_matrix
 from camtorch.values.arguments import Numbers, as_coordinates, as_values
 
@@ -89,8 +89,10 @@ def spread(adjusted: Adjusted, model: type[Camera], camera: int) -> Spread:
     frame = torch.cat((by_shared @ shared, torch.linalg.qr(by_noise.mT, mode="r").R.mT), -1)
     count = parameters.shape[-1]
     own = shared.new_zeros(len(shared), count + 6, shared.shape[-1])
-    places, indices = places_of(equations.columns, camera, range(count + 6))
+    (places, indices), mounted = adjusted.problem.learnt[camera], adjusted.problem.mounted[camera]
     own[:, indices] = shared[:, places]
+    if mounted:
+        own[:, count:] = shared[:, mounted]
     turn, shift = own[:, count : count + 3], own[:, count + 3 :]
     # the first camera's frame, moved to this camera's
     rotation = mounts.rotations[:, camera]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from ctypes import addressof, c_int64
 from typing import NamedTuple
 
@@ -16,19 +15,11 @@ from camtorch.native.structs import Steps
 class Equations(NamedTuple):
     """Triangles of the linearised problem, with L unknowns of each view, and G unknowns that all views share.
 
-    A row of `view` means view[:L] * step of the view + view[L:-1] * shared step = -view[-1]. `columns` names the shared
-    unknowns by camera (-1 for the board's bend) and index of a parameter, from 4 + n on for the camera's mount.
+    A row of `view` means view[:L] * step of the view + view[L:-1] * shared step = -view[-1].
     """
 
     view: Tensor  # (B, V, L, L + G + 1)
     shared: Tensor  # (B, G + 1, G + 1): the rest of all views
-    columns: tuple[tuple[int, int], ...] = ()  # (G,)
-
-
-def places_of(columns: Sequence[tuple[int, int]], camera: int, indices: range) -> tuple[list[int], list[int]]:
-    """Return the places of a camera's unknowns among `columns`, of those that have one of the indices, and these."""
-    found = [(place, index) for place, (of, index) in enumerate(columns) if of == camera and index in indices]
-    return [place for place, _ in found], [index for _, index in found]
 
 
 _NOTHING = 1e-20  # of a column's squares: the rounding left of a column that is a sum of others
@@ -51,7 +42,6 @@ class System:
             equations = Equations(
                 torch.where(keep[:, None, None], equations.view, 0.0),
                 torch.where(keep[:, None, width:], equations.shared, 0.0),
-                equations.columns,
             )
             # without a column the rest is not a triangle
             self.equations = equations._replace(shared=torch.linalg.qr(equations.shared, mode="r").R)
