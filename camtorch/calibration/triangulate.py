@@ -59,7 +59,8 @@ def triangulate(
 
     Returns:
         points (*N, 3) in the world's frame, rms (*N,) in px and valid (*N,) bool. A point is invalid, finite and
-        without meaning, if fewer than two cameras see it, or its rays do not meet in front of all of them.
+        without meaning, if fewer than two cameras see it, its rays do not meet in front of all of them, or a surface
+        (`Splined`) ends before it.
 
     Raises:
         TypeError: If cameras, extrinsics or pixels have a wrong type. ValueError: If shapes or numbers do not fit,

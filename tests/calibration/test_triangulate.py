@@ -144,6 +144,21 @@ DRCAL_PAIR = [  # a calibration by boards with noise of 0.3 px
 DRCAL_POSE = [0.010354696, 0.049334616, -0.020189797], [-0.2001096, 0.010078093, 0.0058487069]
 
 
+def test_a_point_beyond_the_end_of_a_surface_is_invalid():
+    wide = ct.KannalaBrandt([300.0, 300, 319.5, 239.5], [0.02, -0.01, 0.003, -0.001], image_size=(480, 640)).double()
+    surface = wide.requires_grad_(False).convert("splined").camera
+    angles = torch.linspace(0.5, 1.6, 1000).double()
+    across = torch.stack((angles.sin(), 0 * angles, angles.cos()), -1)
+    end = angles[surface.project(across)[1]][-1]
+    poses = ct.Extrinsics([[0.0] * 3] * 2, [[0.0] * 3, [0.0, -0.3, 0.0]]).double().requires_grad_(False)
+    for past, has_pixel in ((-0.01, True), (0.01, False)):
+        at = torch.stack([3 * torch.stack((a.sin(), 0 * a, a.cos())) for a in (end - 0.002, end + past)])
+        pixels = surface.project(at[0])[0], wide.project(poses[1](at[1]))[0]
+        points, rms, valid = ct.triangulate([surface, wide], poses, torch.stack(pixels))
+        assert bool(valid) is bool(surface.project(points)[1]) is has_pixel
+        assert bool(torch.isfinite(rms)) is has_pixel
+
+
 def test_derivatives_give_the_sigmas_of_drcal():
     """As the page of what left says: no point depends on the pixels of another."""
     cameras = [ct.BrownConrady(*(torch.tensor(v).double() for v in of), image_size=(480, 640)) for of in DRCAL_PAIR]
