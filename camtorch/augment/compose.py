@@ -77,8 +77,7 @@ class Compose(Augmentation):
         super().__init__(**options)
         self.augmentations = nn.ModuleList(parts)
         self._check_parts()
-        mirrorings = {repr(m.key): m for part in parts if (m := part.mirroring) is not None}
-        if len(mirrorings) > 1:
+        if len({repr(part.mirroring.key) for part in parts if part.mirroring is not None}) > 1:
             raise ValueError(f"{name}: flips must have equal landmarks, lateral_axis and swap_sides; got others")
 
     def _check_parts(self) -> None:
@@ -93,7 +92,8 @@ class Compose(Augmentation):
                         f"{self._name}: images are sampled once, so parts must have one {key}; got {given[key]!r} of "
                         f"{kind}. Pass it to {self._name} itself"
                     )
-            if error := part._chain_error(parts[i + 1 :], kind):
+            error = part._chain_error(parts[i + 1 :], kind)
+            if error is not None:
                 raise ValueError(f"{self._name}: parts must {error}; got {kind} at place {i}")
 
     def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:

@@ -222,8 +222,11 @@ class Mirroring:
         pixels = [one for kind, value in named.values() if kind in _SURELY_LANDMARKS for one in _batches(value)]
         faces = {tuple(one.shape[1:3]) for one in pixels if one.ndim == 4}  # (F, N)
         # key -> its field, and whether each landmark has a flag, or one number, instead of a dim of coordinates
-        pairs = [(name, key) for name in kinds for key in (name, f"{name}_valid") if key in moved]
-        keys = {key: (name, kinds[name] is None or key != name) for name, key in pairs}
+        keys: dict[str, tuple[str, bool]] = {}
+        for name, kind in kinds.items():
+            for key in (name, f"{name}_valid"):
+                if key in moved:
+                    keys[key] = name, kind is None or key != name
         single = [key for key in keys if not (batched or isinstance(moved[key], list))]
         moved |= {key: moved[key][None] for key in single}
         for key, (name, flags) in keys.items():
@@ -232,10 +235,10 @@ class Mirroring:
             each = zip(_batches(value), rows.split(1) if isinstance(value, list) else [rows], strict=False)
             swapped = [self.swapped(name, kinds[name], batch, row, flags, faces) for batch, row in each]
             moved[key] = [batch[0] for batch in swapped] if isinstance(value, list) else swapped[0]
-        if mirrored is not None:
-            for left, right in [(f"{left}{end}", f"{right}{end}") for left, right in sides for end in ("", "_valid")]:
-                if left in keys and right in keys:
-                    moved[left], moved[right] = exchanged(moved[left], moved[right], mirrored)
+        for left, right in sides:
+            for one, other in ((left, right), (f"{left}_valid", f"{right}_valid")):
+                if mirrored is not None and one in keys and other in keys:
+                    moved[one], moved[other] = exchanged(moved[one], moved[other], mirrored)
         moved |= {key: moved[key][0] for key in single}
 
 
