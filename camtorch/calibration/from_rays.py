@@ -113,7 +113,7 @@ def _kept_values(asked: Model, size: tuple[int, int] | None, owner: str) -> Tens
 
 def _as_seen(
     pixels: Numbers, rays: Numbers, weights: Numbers | None, owner: str
-) -> tuple[fitting.Observations, torch.Size]:
+) -> tuple[fitting.RayPixels, torch.Size]:
     """Return rows of unit rays (C, N, 3) with their pixels and weights, and the batch dims of the cameras.
 
     Rays that are not finite, or have no length, get no weight.
@@ -146,7 +146,7 @@ def _as_seen(
         counted = counted * given.sqrt()  # of squares: the fit weighs errors
     axis = rows.new_tensor([0.0, 0.0, 1.0])
     unit = torch.where(good[..., None], rows / torch.where(good, lengths, 1.0)[..., None], axis)
-    seen = fitting.Observations(unit, torch.where(good[..., None], places, 0.0), counted)
+    seen = fitting.RayPixels(unit, torch.where(good[..., None], places, 0.0), counted)
     numbers = seen.valid.sum(-1)
     if not seen.valid.numel() or not bool((numbers >= _FEWEST_RAYS).all()):
         raise ValueError(
@@ -156,7 +156,7 @@ def _as_seen(
     return seen, batch
 
 
-def _fit_unified(seen: fitting.Observations, owner: str) -> Camera:
+def _fit_unified(seen: fitting.RayPixels, owner: str) -> Camera:
     """Return the best of a few unified lenses (C,): their focal lengths and axis are linear in the pixels."""
     lenses, costs = [], []
     x, y, z = seen.rays.unbind(-1)

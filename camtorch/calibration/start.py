@@ -337,8 +337,8 @@ def _fit_model(lens: Lens, few: Observations, asked: Model) -> Lens:
         by_radii = views.radii(camera, slopes, (_REACH * reach).clamp(max=math.pi))
         starts = model.fit_start(asked.names[4:], *by_radii)[:, 0]
     begun, held = _coefficients_to_try(asked, starts, ideal)
-    seen = fitting.Observations(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
-    seen = fitting.Observations(*(t.expand(len(begun), *t.shape[1:]) for t in seen))
+    seen = fitting.RayPixels(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
+    seen = fitting.RayPixels(*(t.expand(len(begun), *t.shape[1:]) for t in seen))
     template = fixed_camera(model, slopes[:1], ideal[None])
     slopes = slopes.expand(len(begun), -1)
     ones = slopes.new_tensor([1.0, 1.0, 0.0, 0.0]).expand_as(slopes)

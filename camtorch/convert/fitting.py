@@ -22,15 +22,15 @@ _LEAST_SLOPE = 1e-3  # the least slope of a lens at the axis when a fit starts
 _LOST = 0.1  # the error, in focal lengths, of a ray without a pixel when alternatives are compared
 
 
-class Observations(NamedTuple):
+class RayPixels(NamedTuple):
     """Rays (C, N, 3), their pixels (C, N, 2), and weights of the errors (C, N), 0 for no ray or no pixel."""
 
     rays: Tensor
     pixels: Tensor
     weights: Tensor
 
-    def of(self, rows: Tensor) -> Observations:
-        return Observations(*(t[rows] for t in self))
+    def of(self, rows: Tensor) -> RayPixels:
+        return RayPixels(*(t[rows] for t in self))
 
     @property
     def valid(self) -> Tensor:
@@ -44,7 +44,7 @@ class Observations(NamedTuple):
 
 
 def fit(
-    camera: CameraLike, observations: Observations, starts: Tensor, slopes: Tensor, fixed: Tensor | None = None
+    camera: CameraLike, observations: RayPixels, starts: Tensor, slopes: Tensor, fixed: Tensor | None = None
 ) -> Tensor:
     """Return the parameters (C, 4 + n) at which a camera projects rays nearest to their pixels.
 
@@ -86,7 +86,7 @@ def fit(
 
 
 def _fit_linear(
-    camera: CameraLike, observations: Observations, slopes: Tensor, smooth: Tensor, fixed: Tensor | None
+    camera: CameraLike, observations: RayPixels, slopes: Tensor, smooth: Tensor, fixed: Tensor | None
 ) -> Tensor:
     """Fit a lens that is linear in its coefficients in one step, at given focal lengths and pixels of the axis."""
     parameters = torch.cat((slopes, slopes.new_tensor(camera.ideal(smooth.shape[-1])).expand(len(slopes), -1)), -1)
@@ -103,7 +103,7 @@ def _fit_linear(
     return parameters
 
 
-def refine_minimax(camera: CameraLike, observations: Observations, parameters: Tensor, wanting: Tensor) -> Tensor:
+def refine_minimax(camera: CameraLike, observations: RayPixels, parameters: Tensor, wanting: Tensor) -> Tensor:
     """Return parameters (C, 4 + n) near the given ones with a smaller largest error, for rows (C,) that are `wanting`.
 
     Lawson's algorithm: repeated weighted least squares; each time the weight of a square is multiplied by its error.
@@ -133,7 +133,7 @@ def refine_minimax(camera: CameraLike, observations: Observations, parameters: T
     return best
 
 
-def _distances(observations: Observations, camera: CameraLike, parameters: Tensor) -> Tensor:
+def _distances(observations: RayPixels, camera: CameraLike, parameters: Tensor) -> Tensor:
     """Return the distances (C, N) in pixels between projections and observations."""
     residuals = _residuals(observations, parameters, to_sensor(camera, parameters[:, 4:], observations.rays))
     distances: Tensor = torch.linalg.vector_norm(residuals, dim=1)
@@ -150,14 +150,14 @@ def bounds(camera: CameraLike, parameters: Tensor) -> tuple[Tensor, Tensor]:
     return low, high
 
 
-def _residuals(observations: Observations, parameters: Tensor, seen: SensorPoints) -> Tensor:
+def _residuals(observations: RayPixels, parameters: Tensor, seen: SensorPoints) -> Tensor:
     """Return the weighted residuals (C, 2, N) in pixels."""
     fx, fy, cx, cy = columns(parameters[:, :4])
     u, v = observations.pixels.unbind(-1)
     return torch.stack((fx * seen.a + cx - u, fy * seen.b + cy - v), 1) * observations.weights[:, None]
 
 
-def _cost(camera: CameraLike, observations: Observations, parameters: Tensor) -> Tensor:
+def _cost(camera: CameraLike, observations: RayPixels, parameters: Tensor) -> Tensor:
     """Return the sums of squares (C,); infinite if a weighted ray is not covered or the coefficients are undefined."""
     seen = to_sensor(camera, parameters[:, 4:], observations.rays)
     lost = (~seen.covered & (observations.weights > 0)).any(-1)
@@ -170,7 +170,7 @@ def _cost(camera: CameraLike, observations: Observations, parameters: Tensor) ->
 class _Fit:
     """The problem for `levenberg_marquardt.minimise`, whose state is the parameters (C, P)."""
 
-    def __init__(self, camera: CameraLike, observations: Observations, low: Tensor, high: Tensor):
+    def __init__(self, camera: CameraLike, observations: RayPixels, low: Tensor, high: Tensor):
         self.camera, self.observations, self.low, self.high = camera, observations, low, high
         self.rounding = rounding_of(observations.pixels, observations.weights.square())
         (self.free,) = (low < high).any(0).nonzero(as_tuple=True)

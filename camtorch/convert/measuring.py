@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from camtorch.convert import views
-from camtorch.convert.fitting import Observations
+from camtorch.convert.fitting import RayPixels
 from camtorch.least_squares.jacobians import to_sensor
 from camtorch.projection.camera_like import CameraLike
 from camtorch.rays.lattices import ray_fan
@@ -26,8 +26,8 @@ class Reference(NamedTuple):
     camera: CameraLike
     image_size: tuple[int, int] | None
     lattice: views.Lattice
-    rays: Observations
-    all_rays: Observations
+    rays: RayPixels
+    all_rays: RayPixels
 
     @property
     def reach(self) -> Tensor:
@@ -49,11 +49,11 @@ def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> 
     The largest error is searched from the highest peaks among the nodes, and on the rim of the largest angle.
     """
 
-    def compared(rays: Observations) -> tuple[Tensor, Tensor]:
+    def compared(rays: RayPixels) -> tuple[Tensor, Tensor]:
         pixels, mapped = target.project(rays.rays)
         return torch.linalg.vector_norm(pixels - rays.pixels, dim=-1), mapped
 
-    def reached(rays: Observations) -> Tensor:
+    def reached(rays: RayPixels) -> Tensor:
         # rays out of the fit's reach are no part of its result
         return to_sensor(target, k, rays.rays).covered | exact[:, None]
 
@@ -65,7 +65,7 @@ def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> 
     errors, some = torch.where(inside, errors, 0.0), inside.any(-1)
     max_angle = torch.where(inside, angles, 0.0).amax(-1)
 
-    def error_within(rays: Observations) -> Tensor:
+    def error_within(rays: RayPixels) -> Tensor:
         errors, mapped = compared(rays)
         return torch.where(mapped & rays.valid & (rays.angles <= max_angle[:, None]), errors, 0.0)
 

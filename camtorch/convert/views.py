@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.convert.fitting import Observations
+from camtorch.convert.fitting import RayPixels
 from camtorch.projection.camera_like import CameraLike
 from camtorch.rays import lattices
 
@@ -29,7 +29,7 @@ class Lattice(NamedTuple):
         """Return the nodes (C, side^2, 2)."""
         return lattices.pixel_lattice(self.low, self.high, self.side, self.side).flatten(1, 2)
 
-    def sampled(self, camera: CameraLike, places: Tensor) -> Observations:
+    def sampled(self, camera: CameraLike, places: Tensor) -> RayPixels:
         """Return the rays of a camera at places (C, N, 2)."""
         if self.are_pixels:
             rays, found = camera.unproject(places)
@@ -38,7 +38,7 @@ class Lattice(NamedTuple):
             found = torch.ones_like(rays[..., 0], dtype=torch.bool)
         pixels, valid = camera.project(rays)
         valid = valid & found & (lattices.angles_from_axis(rays) <= self.limit * (1 + 1e-12))
-        return Observations(rays, pixels, valid.to(pixels.dtype))
+        return RayPixels(rays, pixels, valid.to(pixels.dtype))
 
 
 def lattice(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> Lattice:
@@ -67,29 +67,29 @@ def lattice(camera: CameraLike, image_size: tuple[int, int] | None, side: int, l
     return Lattice(low, high, side, True, limit)
 
 
-def sample(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> Observations:
+def sample(camera: CameraLike, image_size: tuple[int, int] | None, side: int, limit: float) -> RayPixels:
     """Return side^2 rays on the image or in all directions; those that the camera has up to `limit` are valid."""
     nodes = lattice(camera, image_size, side, limit)
     return nodes.sampled(camera, nodes.nodes())
 
 
-def with_rings(whole: Observations, camera: CameraLike, image_size: tuple[int, int] | None) -> Observations:
+def with_rings(whole: RayPixels, camera: CameraLike, image_size: tuple[int, int] | None) -> RayPixels:
     """Return the rays and more of them on circles around the axis: errors of a radial lens change along radii."""
     reach = torch.where(whole.valid, whole.angles, 0.0).amax(-1, keepdim=True)
     # steps of float32 might exceed half a circle
     steps = torch.linspace(0, 1, _RADII, dtype=reach.dtype, device=reach.device)
     rings = seen(camera, image_size, lattices.ray_fan(reach * steps, _AZIMUTHS))
-    return Observations(*(torch.cat(pair, 1) for pair in zip(whole, rings, strict=True)))
+    return RayPixels(*(torch.cat(pair, 1) for pair in zip(whole, rings, strict=True)))
 
 
-def seen(camera: CameraLike, image_size: tuple[int, int] | None, fan: Tensor) -> Observations:
+def seen(camera: CameraLike, image_size: tuple[int, int] | None, fan: Tensor) -> RayPixels:
     """Return the rays (C, A * N, 3) of a fan (C, A, N, 3); those on the image are valid."""
     rays = fan.flatten(1, 2)
     pixels, valid = camera.project(rays)
     if image_size is not None:
         low, high = lattices.image_edges(image_size, pixels)
         valid = valid & (pixels >= low).all(-1) & (pixels <= high).all(-1)
-    return Observations(rays, pixels, valid.to(pixels.dtype))
+    return RayPixels(rays, pixels, valid.to(pixels.dtype))
 
 
 def focal_at_axis(camera: CameraLike) -> Tensor:
