@@ -1,5 +1,7 @@
 """Metric depth for any lens: a canonical focal length, for the images or for the depth."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal

@@ -1,5 +1,7 @@
 """Limits of a lens's coefficients, beyond which it would fold or bend too much on an image."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 
