@@ -289,7 +289,8 @@ class Change:
     def camera_for_sample(self, batched: bool) -> Camera:
         """Return a copy of the cameras after, or of the one of a change of one sample: a sample's, not the change's."""
         first = self.parts[0]
-        if isinstance(moves := first.moves, LazyWarp):
+        moves = first.moves
+        if isinstance(moves, LazyWarp):
             if not batched and moves.intrinsics.ndim == 1:
                 return moves.new_target()
             if batched and first.rows is None and not self.mixed:

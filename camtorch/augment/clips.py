@@ -38,7 +38,8 @@ class Clips:
         given = {name: value for name, value in sample.items() if name not in OWN and value is not None}
         kinds = {name: kind_of(name, value, fields, owner) for name, value in given.items()}
         dims = {name: getattr(value, "ndim", 0) for name, value in given.items()}
-        if (image := next((name for name, kind in kinds.items() if kind == "image" and dims[name] == 5), None)) is None:
+        image = next((name for name, kind in kinds.items() if kind == "image" and dims[name] == 5), None)
+        if image is None:
             return None
         per_clip = ["camera", "rotation", PLACE]
         for name in (name for name, kind in kinds.items() if kind == "K"):

@@ -165,8 +165,10 @@ class CameraDrawer(Augmentation):
         if start is None:
             return self._part_by_torch(source, values)
         made = start.warp(source, values, self._warp_options)
-        if self.min_filled and (min(made.filled, default=1) < self.min_filled or max(made.zooms, default=1) > 1):
-            self._tell_of(source, lambda: made.target, torch.tensor([*made.zooms]), torch.tensor([*made.filled]))
+        if self.min_filled:
+            are_filled = min(made.filled, default=1) >= self.min_filled
+            if not are_filled or max(made.zooms, default=1) > 1:
+                self._tell_of(source, lambda: made.target, torch.tensor([*made.zooms]), torch.tensor([*made.filled]))
         options = self.options
         may_stay_lazy = made.target_native is not None and options["tolerance"] and not options["antialias"]
         if may_stay_lazy and self.beside_the_camera.isdisjoint(self.ranges):
@@ -178,10 +180,9 @@ class CameraDrawer(Augmentation):
 
         None if a camera learns, or native code lacks a range or a model.
         """
-        like = self._modules.get("like")  # found in less time than by the attribute
         tensors: tuple[Tensor, ...] = (source.intrinsics, source.distortion)
+        like = None if self._modules.get("like") is None else self._like_for(source)  # most mounts have none
         if like is not None:
-            like = self._like_for(source)
             tensors += like.tensors
         if not hold_numbers(tensors):
             return None
@@ -295,10 +296,12 @@ class CameraDrawer(Augmentation):
 
         return self._memo(base.tensors, ("nominal", type(base), base.image_size, size, self.ranges["fov"]), made)
 
-    def _like_for(self, source: Camera) -> Any:
+    def _like_for(self, source: Camera) -> Camera | None:
         """Return `like`, on the CPU if the source is there and its numbers are known; None without `like`."""
-        like = self.like
-        return like if like is None or not source.intrinsics.is_cpu else twin_of(like) or like
+        like: Camera | None = self.like
+        if like is None or like.intrinsics.is_cpu or not source.intrinsics.is_cpu:
+            return like
+        return twin_of(like) or like
 
     def _size_of(self, source: Camera) -> tuple[int, int]:
         return self.image_size or source.size_for(self._name)

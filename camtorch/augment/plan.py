@@ -77,15 +77,11 @@ class SamplePlan:
     fields: Mapping[str, str]  # name -> kind of what moves, in the order of the sample
     batched: bool
     count: int
+    matrices: Sequence[str]  # names of the fields that are matrices K
     masks: Sequence[str]  # names of the masks of validity that come out: "image_valid" and so on
     mask_fill: float
     calls: Kept | None
     """Maps settings to the `CallOfFields`; None if autograd may record."""
-
-    @functools.cached_property
-    def matrices(self) -> Sequence[str]:
-        """The names of the fields that are matrices K."""
-        return [name for name, kind in self.fields.items() if kind == "K"]
 
     def rows(self, value: Any) -> Any:
         """Return a value with a dim B; a list has one already."""

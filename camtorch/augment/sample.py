@@ -158,7 +158,8 @@ class SampleTransform(KeepsCamera, nn.Module):
         self._calls = Calls()
         self.camera = camera
         self.fields: dict[str, str] = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
-        if wrong := {k: v for k, v in self.fields.items() if v not in (*KINDS, KEEP)}:
+        wrong = {name: kind for name, kind in self.fields.items() if kind not in (*KINDS, KEEP)}
+        if wrong:
             raise ValueError(f"{self._name}: fields must map names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
         self.options: Options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
         self.mask_fill: float = as_number(mask_fill, "mask_fill", self._name)
@@ -226,7 +227,8 @@ class SampleTransform(KeepsCamera, nn.Module):
                 named = moving(sample, fields, self._name)
                 camera = camera_of_images(named, guess, self.needs_camera, self._name)
         form = form_of(sample, camera, fields, self._calls.revision)
-        if form is not None and (known := self._calls.plans.entry((), form)) is not None:
+        known = None if form is None else self._calls.plans.entry((), form)
+        if known is not None:
             camera = one_or_batch(camera) if camera.intrinsics.ndim > 1 else camera
             batch = Batch(known.result, sample, camera, must_check=not predicted)
         else:
@@ -263,7 +265,8 @@ class SampleTransform(KeepsCamera, nn.Module):
         flags = dict.fromkeys(["image_valid", *(f"{name}_valid" for name, kind in kinds.items() if kind in IMAGES)])
         masks = [key for key in flags if sample.get(key) is not None or (self.valid_mask and key == "image_valid")]
         calls = Kept() if are_free(*tensors.values()) else None
-        plan = SamplePlan(kinds, batched, count, masks, self.mask_fill, calls)
+        matrices = [name for name, kind in kinds.items() if kind == "K"]
+        plan = SamplePlan(kinds, batched, count, matrices, masks, self.mask_fill, calls)
         return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, must_check=False)
 
     def _check_matrices(self, batch: Batch, sample: Sample) -> None:
@@ -293,7 +296,8 @@ class SampleTransform(KeepsCamera, nn.Module):
             predicted: whether values come from a network, and are not checked.
         """
         sample = self._given(sample, {})
-        if clips := self._clips(sample, kinds):
+        clips = self._clips(sample, kinds)
+        if clips:
             return clips.restored(self.moved_by(change, clips.frames(None), kinds, predicted))
         if change.count == 1:
             named = moving(sample, {**self.fields, **(kinds or {})}, self._name).values()
@@ -329,7 +333,8 @@ class SampleTransform(KeepsCamera, nn.Module):
                 given = sample.get(key)
                 moved[key] = valid if given is None else still_valid(key, valid, given, self._name)
         for key in plan.masks:
-            if (seen := self._seen(key, sample.get(key), plan, change)) is not None:
+            seen = self._seen(key, sample.get(key), plan, change)
+            if seen is not None:
                 moved[key] = (seen if batched else seen[0]).contiguous()
         if "rotation" not in plan.fields:
             moved["rotation"] = change.rotation_for_sample(batched)
