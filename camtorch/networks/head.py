@@ -188,7 +188,7 @@ class CameraHead(GeometryModule):
             return none
         if torch.onnx.is_in_onnx_export():  # which has no cummax
             raise RuntimeError(
-                f"{type(self).__name__}: model must be 'pinhole' in torch.onnx.export; got {self.model.__name__}. "
+                f"{type(self).__name__}: model must be 'pinhole' in torch.onnx.export; got {self._model_name()}. "
                 "Export the network up to head.linear, and call head.camera(numbers) in Python; torch.export takes all"
             )
         step = (self._discs[-1] - self._discs[0]).to(numbers) / (_NODES - 1)
@@ -201,8 +201,11 @@ class CameraHead(GeometryModule):
         gauge = size / limits.along(moves / size.clamp(min=1e-12), disc.exp())
         return moves * torch.rsqrt(1 + gauge * gauge)
 
+    def _model_name(self) -> str:
+        return self.model.__name__
+
     def extra_repr(self) -> str:
-        return f"{self.model.__name__}, image_size={self.image_size}, numbers=({' '.join(self.names)})"
+        return f"{self._model_name()}, image_size={self.image_size}, numbers=({' '.join(self.names)})"
 
 
 def _bound(x: Tensor) -> Tensor:
