@@ -1,7 +1,5 @@
 """Crops that look at a box of each sample, such as a face, without perspective error; labels and camera follow."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import torch

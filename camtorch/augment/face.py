@@ -1,7 +1,5 @@
 """The data normalisation of gaze estimation, for any lens."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 

@@ -1,7 +1,5 @@
 """How much of a new image shows the old one, and the zoom and the rotation with which enough of it does."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from typing import Any

@@ -1,7 +1,5 @@
 """The base of front ends, which pass the samples of other libraries to an augmentation."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from camtorch.augment.augmentation import Augmentation

@@ -1,7 +1,5 @@
 """Landmarks of faces and bodies: which change places in a mirror, and where those of a face are on a head."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The kind of a field by its name: a kind's own, an alias, a pattern, or one that begins with a kind."""
 
-from __future__ import annotations
-
 import difflib
 import functools
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The form of samples, and its plan: which fields move, whether there is a dim B, and the call of C for most."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping, Sequence

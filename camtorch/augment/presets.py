@@ -1,7 +1,5 @@
 """Cameras by name: calibrated and typical ones, whose lenses augmentations use."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Literal

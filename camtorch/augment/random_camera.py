@@ -1,7 +1,5 @@
 """Random mounts, lenses and cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar, Literal

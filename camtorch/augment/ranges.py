@@ -11,8 +11,6 @@ of these forms:
   then true above one half, and so is the `apply` of a part of a `Compose`, whose draw is named "0.apply" and so on.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

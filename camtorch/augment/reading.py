@@ -1,7 +1,5 @@
 """What is read of a sample before it moves: its fields by their kinds, checked, and its cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A random rolling shutter in front of the camera of a sample."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import ClassVar
 

@@ -3,8 +3,6 @@
 The frame lies in the board, as OpenCV's: x right, y down, z away from the viewer. Lengths are in the caller's unit.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar

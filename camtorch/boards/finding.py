@@ -1,7 +1,5 @@
 """Finding boards in photographs for `ct.calibrate`: `find_board`."""
 
-from __future__ import annotations
-
 import glob
 import os
 import re

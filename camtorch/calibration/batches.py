@@ -1,7 +1,5 @@
 """Arguments of functions of many independent rows: tensors that keep their graphs, cameras of as many rows."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """A camera from pixels and their rays, whatever predicted them: `fit`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Sequence
 

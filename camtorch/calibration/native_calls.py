@@ -1,7 +1,5 @@
 """Calls of native code for poses and views, in threads; `rays.py` and `pnp.py` have the same formulas."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from ctypes import addressof, c_int64
 from functools import partial

@@ -1,7 +1,5 @@
 """The pose on which most seen points agree, by random samples: RANSAC on rays of any angle."""
 
-from __future__ import annotations
-
 from ctypes import addressof, c_int64
 from functools import partial
 from typing import NamedTuple

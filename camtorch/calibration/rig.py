@@ -1,7 +1,5 @@
 """The calibration of several cameras from views of the same boards: `calibrate_rig` and its result."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace

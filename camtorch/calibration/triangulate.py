@@ -1,7 +1,5 @@
 """Points from the pixels at which several cameras see them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar, cast
 

@@ -1,7 +1,5 @@
 """The result of a calibration, with its use and the limits of its data in words, and advice."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Camera models by their keys, and by the names that other tools give them."""
 
-from __future__ import annotations
-
 import difflib
 import functools
 import importlib

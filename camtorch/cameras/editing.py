@@ -1,7 +1,5 @@
 """The camera of an edited image: cropped, padded, scaled, flipped, turned by quarters."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar, cast
 

@@ -1,7 +1,5 @@
 """Parameters of a camera that are frozen by name, while the others learn."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

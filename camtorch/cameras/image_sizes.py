@@ -1,7 +1,5 @@
 """Warnings of image sizes that do not fit a camera's numbers: its principal point is far from the image's middle."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from camtorch.evaluate.tensors import is_kept, is_predicted, row_of, values_of

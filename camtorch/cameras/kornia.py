@@ -1,7 +1,5 @@
 """Cameras as kornia has them. `import camtorch` does not load kornia."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

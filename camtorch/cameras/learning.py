@@ -1,7 +1,5 @@
 """Groups of a camera's parameters for an optimizer, whose steps are measured in pixels."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A batch of cameras of any models, which is evaluated model by model."""
 
-from __future__ import annotations
-
 import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The view of a camera in notebooks: its numbers, and a small image of its angles."""
 
-from __future__ import annotations
-
 import html
 import math
 

@@ -1,7 +1,5 @@
 """The numbers that a camera is made of, as users give them: checked, and from a matrix or a field of view."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, cast

@@ -1,7 +1,5 @@
 """Named cameras and their poses, as a calibration file holds them."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, ItemsView, Iterator, KeysView, Mapping, MutableMapping, Sequence, ValuesView
 from itertools import islice
 from typing import TypeVar, cast

@@ -1,7 +1,5 @@
 """Models that are special cases of others, and coefficients carried over from one to another."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator, Mapping
 

@@ -1,7 +1,5 @@
 """The result of a conversion: the camera of another model, and its differences."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Generic, TypeVar

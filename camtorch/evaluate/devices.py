@@ -1,7 +1,5 @@
 """Values on devices other than the CPU: those known on the CPU as well, for which nobody waits, and what is sent."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any

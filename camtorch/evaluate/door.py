@@ -1,7 +1,5 @@
 """The way of a call: native code on a CPU if nothing traces or transforms the call, else the formula in torch."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import NoneType

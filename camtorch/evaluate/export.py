@@ -1,7 +1,5 @@
 """Exported programs: modules that are constants of them, recorded with operators that other runtimes have."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext

@@ -1,7 +1,5 @@
 """Forms of the formula that torch's compilers handle best: planes, masks, kept values, classes by their names."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable
 from typing import Any, TypeVar, cast

@@ -15,8 +15,6 @@ transform of torch.func holds, of one beside such a transform, of a dual one, an
     in_graph            no     yes     yes      no           yes   yes     derivatives pass, or it is traced
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Linearised least squares as triangles of a QR: of each view's own unknowns, and of those that all views share."""
 
-from __future__ import annotations
-
 from ctypes import addressof, c_int64
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Points of rays on a camera's sensor plane, also beyond folds, and their derivatives by ray and coefficients."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The Levenberg-Marquardt method for a batch of independent problems."""
 
-from __future__ import annotations
-
 from typing import NamedTuple, Protocol
 
 import numpy as np

@@ -8,8 +8,6 @@ Images are 176x144 to 4096x3072 pixels; the driver rounds sizes to multiples of 
 https://docs.kernel.org/userspace-api/media/drivers/dw100.html
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 To add a format, write one file in this folder, as `protocol.py` explains, and name its object below.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from typing import Any, Literal, TypedDict

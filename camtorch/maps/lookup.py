@@ -1,7 +1,5 @@
 """A map as read, and the exact positions to compare it with: positions on the source's image for target pixels."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial

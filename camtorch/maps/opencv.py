@@ -7,8 +7,6 @@ CV_16UC1, the rest in thirty-seconds, five bits of y above five of x. Integers a
 Pixels without a position get -32768, which `cv2.remap` fills by BORDER_CONSTANT.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import re

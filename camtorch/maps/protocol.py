@@ -1,7 +1,5 @@
 """The interface of a format of maps: its names, its options, and functions to write and read."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """The content of a written map, and its error."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -11,8 +11,6 @@ largest of the usual block sizes whose padding the register holds, and the paddi
 Technical reference manuals, e.g. SPRUJ28, "LDC Lens Distortion Back-Mapping" and "LDC Input Block Fetch".
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The chart of cameras that are defined from the pixel to the angle; Newton's method finds the other direction."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import ClassVar

@@ -4,8 +4,6 @@ A chart works on component planes, not on interleaved triples. It states which r
 plane are the image of a ray; the camera passes it only those, so no chart guards its own formulas.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """The statements of a camera model: its coefficients and their formula, and facts for edits and fits."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 

@@ -1,7 +1,5 @@
 """Radial factors of lenses, which map a point m to m R(|m|^2): polynomials, ratios of them, and tables."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """The unified chart: the plane of catadioptric and of many fisheye cameras, with up to three learnable parameters."""
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar
 

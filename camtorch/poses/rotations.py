@@ -1,7 +1,5 @@
 """Rotations: vectors and matrices, applied to points."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The protocol of a camera within camtorch; `Camera` is one, and no package below cameras/ imports it."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Calls of the native geometry: rows to pointers and strides, and tiles to threads."""
 
-from __future__ import annotations
-
 import functools
 import operator
 import threading

@@ -3,8 +3,6 @@
 As operators they keep compiled graphs small, and can read values inside vmap as well.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Depth maps: their check, and the distances along pixels' rays."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

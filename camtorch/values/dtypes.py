@@ -1,7 +1,5 @@
 """The dtypes in which images are computed, and the way back to their own."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

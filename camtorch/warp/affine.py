@@ -1,7 +1,5 @@
 """Warps of edited images: mirrored images, and images whose pixels move by crops, scales, flips and quarter turns."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

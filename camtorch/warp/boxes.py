@@ -1,7 +1,5 @@
 """Boxes and polygons moved by a warp, which may bend their edges: points along the edges are moved."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

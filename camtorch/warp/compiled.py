@@ -4,8 +4,6 @@ Exported programs know them by the name of this module. Operators take neither f
 `written` as texts, and `is_last` is "True" if channels come last in memory, else "False".
 """
 
-from __future__ import annotations
-
 import ast
 import math
 from collections.abc import Callable

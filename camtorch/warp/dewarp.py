@@ -1,7 +1,5 @@
 """Dewarp: a Warp that chooses its own target."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Literal

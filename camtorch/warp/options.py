@@ -1,7 +1,5 @@
 """How warps sample images: modes, paddings, fill and the other options."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple, TypeAlias, TypedDict, get_args

@@ -1,7 +1,5 @@
 """Panoramas of a whole turn: a warp extends their images beyond the edges that meet."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

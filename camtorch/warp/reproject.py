@@ -1,7 +1,5 @@
 """Warps to a camera at another place, by a depth map."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 import torch

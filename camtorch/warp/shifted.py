@@ -1,7 +1,5 @@
 """Images of a camera that moved a little, by the depth of the images."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, ClassVar
 

@@ -1,7 +1,5 @@
 """Pinhole views of an image: the faces of a cube, a ring of views around, or one that looks at a box."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any

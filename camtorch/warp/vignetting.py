@@ -1,7 +1,5 @@
 """Vignetting: how much less light a lens lets through, the farther a ray is from the axis."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
