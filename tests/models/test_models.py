@@ -166,9 +166,10 @@ def test_the_angles_of_a_table_do_not_learn():
     assert radii.all()
 
 
-def test_the_laws_have_numbers_to_try_a_model_on():
-    bent = {key for key in KEYS if one(key).distortion_names}
-    assert bent <= RANGES.keys(), "tests/cameras.py says in RANGES how far its coefficients go"
+@pytest.mark.parametrize("key", KEYS)
+def test_the_laws_have_numbers_to_try_a_model_on(key):
+    if one(key).distortion_names:
+        assert key in RANGES, "tests/cameras.py says in RANGES how far its coefficients go"
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (8,)])
