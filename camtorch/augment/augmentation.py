@@ -69,7 +69,8 @@ class Augmentation(SampleTransform):
             `intrinsics`, `camera_matrix`) of a sample is the pinhole camera of the image, and comes before the number.
         p, same_on_batch: how likely a sample is augmented at all; the same draw for the whole batch.
         fields: name -> kind, for fields of other names; "keep" leaves one as it is. A * in a name stands for any
-            characters, as in "observation.images.*"; of several that fit, the first counts.
+            characters, as in "observation.images.*"; of several that fit, the first counts. `camera`, `rotation` and
+            `crop_place` come out by themselves, and a field of another kind needs another name.
         mode, padding_mode, fill, antialias, tolerance: of images; see `Warp`.
         mask_fill: the value of masks where nothing is seen.
         valid_mask: whether `image_valid` (B, 1, H, W) comes out: where the image shows something.

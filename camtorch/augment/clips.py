@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from camtorch.augment.fields import OWN, PLACE, Named
+from camtorch.augment.fields import PLACE, Named
 from camtorch.augment.matrices import check_alike
 from camtorch.augment.names import kind_of
 from camtorch.augment.reading import moving
@@ -35,7 +35,7 @@ class Clips:
 
         fields: name -> kind, of other names. tables: names of the fields with tables of landmarks.
         """
-        given = {name: value for name, value in sample.items() if name not in OWN and value is not None}
+        given = {name: value for name, value in sample.items() if value is not None}
         kinds = {name: kind_of(name, value, fields, owner) for name, value in given.items()}
         dims = {name: getattr(value, "ndim", 0) for name, value in given.items()}
         image = next((name for name, kind in kinds.items() if kind == "image" and dims[name] == 5), None)

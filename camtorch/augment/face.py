@@ -1,7 +1,7 @@
 """The data normalisation of gaze estimation, for any lens."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -57,6 +57,7 @@ class FaceNormalizer(SampleTransform):
         torch.Size([3, 224, 224])
     """
 
+    _own_fields: ClassVar[Sequence[str]] = (*SampleTransform._own_fields, "scale", "source_camera", "source_rotation")
     focal: float
     distance: float
     image_size: tuple[int, int]

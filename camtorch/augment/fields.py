@@ -420,7 +420,8 @@ BOXES = "boxes", *_ANCHORS
 IMAGES = tuple(kind for kind, field in KINDS.items() if field.is_image)
 PLACE = "crop_place"
 """The field of where a crop looks, seen from the first camera; it follows from a sample's camera and rotation."""
-OWN = ("camera", "source_camera", "source_rotation", "scale", PLACE)  # these follow from the change: no kind moves them
+OWN = ("camera", "source_camera", "source_rotation", "scale", PLACE)
+"""These follow from the change: no kind moves them, unless `fields` gives one to a field of the same name."""
 
 
 def field_of(kind: str, value: Tensor) -> Field:

@@ -2,13 +2,14 @@
 
 import difflib
 import functools
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from typing import Any, NoReturn
 
 import numpy as np
 from torch import Tensor
 
-from camtorch.augment.fields import BOXES, KEEP, KINDS
+from camtorch.augment.fields import BOXES, KEEP, KINDS, OWN
 from camtorch.augment.matrices import NAMES
 from camtorch.evaluate.door import pytree
 
@@ -26,21 +27,21 @@ _ANGLES = {"yaw", "pitch", "roll"}
 def kind_of(name: str, value: object, fields: Mapping[str, str], owner: str, single: bool = False) -> str | None:
     """Return a field's key in `KINDS`, None if it is not moved; raise if it may be geometry of unknown name.
 
-    In this order: the name among `fields`; names that end with _valid do not move; a kind's name or an alias; a pattern
-    with * among `fields`; the longest kind that begins the name; the forms of boxes that end it.
+    In this order: the name among `fields`; names of `OWN` and those that end with _valid do not move; a kind's name or
+    an alias; a pattern with * among `fields`; the longest kind that begins the name; the forms of boxes that end it.
 
     fields: the option of that name. single: whether the sample is known to be without a dim B.
     """
     if not isinstance(name, str):
         raise TypeError(f"{owner}: a sample must have strings for names; got {name!r:.80}")
     if name in fields:
-        return None if fields[name] == KEEP else fields[name]
-    if name.endswith("_valid"):
+        return _given_kind(name, fields, owner)
+    if name in OWN or name.endswith("_valid"):
         return None
     kind = name if name in KINDS else ALIASES.get(name)
     pattern = pattern_of(name, fields) if kind is None else None
     if pattern is not None:
-        return None if fields[pattern] == KEEP else fields[pattern]
+        return _given_kind(pattern, fields, owner)
     if kind == "K":
         return _kind_of_matrix(name, value, single)
     kind = kind or _beginning(name, value)
@@ -49,6 +50,29 @@ def kind_of(name: str, value: object, fields: Mapping[str, str], owner: str, sin
         kind = form if form in BOXES else kind
     if kind is None and _may_be_geometry(name, value, single):
         _refuse_unknown(name, value, owner)
+    return kind
+
+
+def check_kinds(fields: Mapping[str, str], own: Iterable[str], owner: str) -> None:
+    """Raise a ValueError if `fields` has a kind that there is not, or another one for a transform's `own` names."""
+    wrong = {name: kind for name, kind in fields.items() if kind not in (*KINDS, KEEP)}
+    if wrong:
+        raise ValueError(f"{owner}: fields must map names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
+    taken = {name: kind for name, kind in fields.items() if name in own and kind != name}
+    if taken:
+        raise ValueError(
+            f"{owner}: fields must not name what comes out of {owner} by itself, {', '.join(own)}; got {taken}. Give "
+            "that field of the samples another name"
+        )
+
+
+def _given_kind(key: str, fields: Mapping[str, str], owner: str) -> str | None:
+    """Return the kind that a key of `fields` gives; None to keep the field as it is."""
+    kind = fields[key]
+    if kind == KEEP:
+        return None
+    if kind not in KINDS:  # which was set after the transform was made
+        check_kinds({key: kind}, (), owner)
     return kind
 
 
@@ -87,10 +111,9 @@ def _refuse_unknown(name: str, value: object, owner: str) -> NoReturn:
 
 
 def pattern_of(name: str, fields: Mapping[str, str]) -> str | None:
-    """Return the first key of `fields`, with a * for any characters, that a name matches."""
+    """Return the first key of `fields` that a name matches, of those in which each * stands for any characters."""
     for key in fields:
-        head, star, tail = key.partition("*")
-        if star and len(name) >= len(head + tail) and name.startswith(head) and name.endswith(tail):
+        if "*" in key and re.fullmatch(re.escape(key).replace(r"\*", ".*"), name, re.DOTALL):
             return key
     return None
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.fields import IMAGES, KINDS, OWN, PLACE
+from camtorch.augment.fields import IMAGES, KINDS, PLACE
 from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.names import ALIASES, kind_of
 from camtorch.augment.sample import Sample, Single
@@ -164,7 +164,7 @@ class Transform(FrontEnd):
         ways, mirroring = dict[str, Way](), self.augmentation.mirroring
         size = getattr(self.augmentation.camera if camera is None else camera, "image_size", None)
         for name, value in sample.items():
-            kind = None if name in OWN or value is None else self._kind(name, value, sample)
+            kind = None if value is None else self._kind(name, value, sample)
             if kind in IMAGES and (name in ALIASES or isinstance(value, (list, tuple))):
                 ways[name] = _way_of_images(name, value, size, kind)
             elif kind in IMAGES:

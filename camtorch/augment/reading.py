@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS, OWN, Named
+from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS, Named
 from camtorch.augment.names import kind_of
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import is_cheap_to_read
@@ -29,7 +29,7 @@ def moving(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str, sin
     """
     named: Named = {}
     for name, value in sample.items():
-        kind = None if name in OWN or value is None else kind_of(name, value, fields, owner, single)
+        kind = None if value is None else kind_of(name, value, fields, owner, single)
         if kind is not None and isinstance(value, (list, tuple)):
             named[name] = kind, [as_tensor(item, f"{name}[{i}]", kind, owner) for i, item in enumerate(value)]
         elif kind is not None:

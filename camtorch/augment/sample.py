@@ -15,9 +15,10 @@ from camtorch.augment.cameras import Unknown, camera_of_images
 from camtorch.augment.change import Change, one_or_batch
 from camtorch.augment.clips import Clips
 from camtorch.augment.devices import remember_camera
-from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS
+from camtorch.augment.fields import FRONT_ENDS, IMAGES, PLACE
 from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess, check_agrees, check_targets, refuse
+from camtorch.augment.names import check_kinds
 from camtorch.augment.plan import Batch, SamplePlan, form_of, move
 from camtorch.augment.reading import check_cameras, check_fields, is_batch, moving
 from camtorch.cameras.camera import Camera
@@ -134,6 +135,8 @@ class SampleTransform(KeepsCamera, nn.Module):
     """Whether pinhole cameras become pinhole cameras, as far as that is known before a draw."""
     mirroring: Mirroring | None = None
     """What changes places in a mirror; None if it never mirrors."""
+    _own_fields: ClassVar[Sequence[str]] = ("camera", "rotation", PLACE)
+    """The names of fields that come out by themselves, and to which `fields` gives no kind."""
 
     def __new__(cls, *args: Any, **options: Any) -> Self:
         """Check the names of arguments, which Python would only call unexpected."""
@@ -158,9 +161,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         self._calls = Calls()
         self.camera = camera
         self.fields: dict[str, str] = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
-        wrong = {name: kind for name, kind in self.fields.items() if kind not in (*KINDS, KEEP)}
-        if wrong:
-            raise ValueError(f"{self._name}: fields must map names to {', '.join(KINDS)} or {KEEP}; got {wrong}")
+        check_kinds(self.fields, self._own_fields, self._name)
         self.options: Options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
         self.mask_fill: float = as_number(mask_fill, "mask_fill", self._name)
         self.valid_mask: bool = as_flag(valid_mask, "valid_mask", self._name)

@@ -163,9 +163,8 @@ class Transform(FrontEnd, v2.Transform):
         kinds, problems = dict[int, str | None](), dict[int, ValueError]()
         single = all(getattr(leaf, "ndim", 0) < 4 for leaf in nest.leaves)  # images of batches have as many dims
         for i, (name, leaf) in enumerate(zip(nest.names, nest.leaves, strict=True)):
-            if name == PLACE:
-                kinds[i] = None
-            elif not (leaf is None or isinstance(leaf, Camera) or name in OWN):
+            is_own = name in OWN and name not in fields and name != PLACE
+            if not (leaf is None or isinstance(leaf, Camera) or is_own):
                 try:
                     kinds[i] = _kind(name, leaf, nest.paths[i], fields, single)
                 except ValueError as error:

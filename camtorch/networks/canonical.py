@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -56,6 +56,7 @@ class CanonicalCamera(SampleTransform):
         ValueError: If the focal length is not positive, `scales` is another word, or a size is given with "depth".
     """
 
+    _own_fields: ClassVar[Sequence[str]] = (*SampleTransform._own_fields, "scale", "source_camera")
     focal: float
     image_size: tuple[int, int] | None
 

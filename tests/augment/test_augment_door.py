@@ -1,6 +1,7 @@
 """What cannot be augmented says so at the door: which field, what it was, what it should be."""
 
 import math
+import re
 
 import PIL.Image
 import pytest
@@ -212,3 +213,38 @@ def test_a_pattern_matches_no_shorter_name(camera):
     assert torch.equal(mount(keypoints=POINTS, lid_dar=torch.ones(2, 9, 3))["lid_dar"], torch.ones(2, 9, 3))
     with pytest.raises(ValueError, match="'lidar' must have a kind"):
         mount(keypoints=POINTS, lidar=torch.ones(2, 9, 3))
+
+
+def test_each_star_of_a_pattern_stands_for_any_characters(camera):
+    rays, names = torch.rand(2, 9, 3), ("obs.front.ray.0", "obs..ray.")
+    mount = RandomMount(camera=camera, fields={"obs.*.ray.*": "points"})
+    out = mount(points=rays, **dict.fromkeys(names, rays))
+    assert all(torch.equal(out[name], out["points"]) for name in names)
+    for other in ("obs.ray.0", "obs.front.ray", "obsxfront.ray.0", "my_obs.front.ray.0"):
+        with pytest.raises(ValueError, match=f"'{other}' must have a kind"):
+            mount(points=rays, **{other: rays})
+    with pytest.raises(ValueError, match=r"'cam0' must have a kind"):  # no other characters are special
+        RandomMount(camera=camera, fields={"cam[0-9]*": "points"})(points=rays, cam0=rays)
+
+
+@pytest.mark.parametrize("name", ["camera", "rotation", "crop_place", "scale", "source_camera", "source_rotation"])
+def test_fields_gives_no_kind_to_what_a_transform_returns(camera, name):
+    transforms = {RandomMount: 3, ct.CanonicalCamera: 5, ct.augment.FaceNormalizer: 6}  # how many they return
+    names = ["camera", "rotation", "crop_place", "scale", "source_camera", "source_rotation"]
+    for transform, count in transforms.items():
+        options = {"focal": 500.0} if transform is ct.CanonicalCamera else {}
+        for kind in ("keep", "points"):
+            if name not in names[:count]:
+                transform(fields={name: kind}, **options)
+                continue
+            with pytest.raises(ValueError, match=f"fields must not name .*{transform.__name__}.*got {{'{name}': "):
+                transform(fields={name: kind}, **options)
+    RandomMount(fields={"rotation": "rotation"})
+
+
+def test_kinds_that_are_set_later_are_checked(camera):
+    mount = RandomMount(camera=camera, fields={"lidar": "points", "b*": "keep"})
+    for key, name in (("lidar", "lidar"), ("b*", "bits")):
+        mount.fields[key] = "pts"
+        with pytest.raises(ValueError, match=f"fields must map names to image,.*got {{'{re.escape(key)}': 'pts'}}"):
+            mount(keypoints=POINTS, **{name: torch.ones(2, 9, 3)})

@@ -200,6 +200,16 @@ def test_numbers_of_unknown_names_are_refused(front_end, monkeypatch):
         assert torch.equal(moved["lidar"], fields["lidar"]) == (kind == "keep")
 
 
+@pytest.mark.parametrize("front_end", FRONT_ENDS)
+def test_fields_comes_before_what_other_transforms_return(front_end, monkeypatch):
+    """`scale` is no geometry, unless `fields` says what it is."""
+    batch = (2,) if front_end == "kornia" else ()
+    fields = sample(*batch) | {"scale": sample(*batch)["points"]}
+    for kinds, moves in (({"scale": "points"}, True), ({"scale": "keep"}, False), ({"sc*": "points"}, False)):
+        moved, want = both(front_end, RandomMount(fields=kinds), camera(), fields, monkeypatch)
+        assert torch.equal(moved["scale"], want["points"] if moves else fields["scale"])
+
+
 @pytest.mark.slow  # for the compiler
 @pytest.mark.parametrize("front_end", ["kornia", "torchvision"])
 def test_front_ends_compile(front_end, monkeypatch):

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from camtorch import augment
 from camtorch.augment.augmentation import put_crop_place
 from camtorch.augment.change import Change
-from camtorch.augment.fields import OWN, PLACE
+from camtorch.augment.fields import PLACE
 from camtorch.augment.front_end import FrontEnd
 from camtorch.augment.kornia.params import Params, params_of_each, with_cameras
 from camtorch.augment.kornia.private import BasicAugmentationBase
@@ -48,7 +48,7 @@ def _read_dict(container: Any, given: Sample, ours: list[FrontEnd]) -> _Dict:
     texts = {name: value for name, value in given.items() if is_text(value)}
     rest = {name: value for name, value in given.items() if name not in texts}
     keys = {name: container._read_datakeys_from_dict((name,))[0] for name in rest}
-    unknown = [n for n, key in keys.items() if n not in OWN and key in ([], [DataKey.CLASS], [DataKey.LABEL])]
+    unknown = [name for name, key in keys.items() if key in ([], [DataKey.CLASS], [DataKey.LABEL])]
     if flags := [name for name in rest if name.endswith("_valid") and name not in unknown]:
         raise ValueError(f"{owner}: a flag must be no kornia key; got {flags[0]}. Use its own keypoints_valid")
     image = next((rest[name] for name, key in keys.items() if key == [DataKey.INPUT]), None)
