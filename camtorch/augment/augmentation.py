@@ -365,7 +365,7 @@ class Augmentation(SampleTransform):
             if count and not calls.has_looked and "image" in plan.fields.values():
                 self.tell_of_empty_images(camera)
         moved = self._moved(sample, batch, change)
-        if self.place or PLACE in sample:
+        if self.place or sample.get(PLACE) is not None:
             put_crop_place(sample, moved, self._name)
         return moved, change
 
@@ -401,10 +401,11 @@ class Augmentation(SampleTransform):
                 "camera="
             )
         turned = sample.get("rotation") if draw is None and self._calls.is_first else None
-        if "camera" in sample and not change.leads_to(sample["camera"], turned):
+        given = sample.get("camera")
+        if given is not None and not change.leads_to(given, turned):
             raise ValueError(
                 f"{self._name}: camera and rotation of the sample must be those that this change made; got "
-                f"{sample['camera']!r:.60}. If the sample is of another call, pass its draw= and the camera= before it"
+                f"{given!r:.60}. If the sample is of another call, pass its draw= and the camera= before it"
             )
         moved = self.moved_by(change.inverse(), sample, predicted=True)
         moved.pop(PLACE, None)  # what comes back is no crop
@@ -436,7 +437,8 @@ class Augmentation(SampleTransform):
 
 def put_crop_place(sample: Mapping[str, Any], moved: dict[str, Any], owner: str) -> None:
     """Put `crop_place` into a moved sample, by its camera and by all that turned it; see `ct.views.crop_place`."""
-    if PLACE in sample and not ("rotation" in sample and "camera" in moved):
+    has_both = sample.get("rotation") is not None and moved.get("camera") is not None
+    if sample.get(PLACE) is not None and not has_both:
         raise ValueError(
             f"{owner}: a sample with {PLACE} must have the rotation and the camera that came with it, as it follows "
             f"from them; got {', '.join(sample)}. Leave {PLACE} out, or keep them"

@@ -103,7 +103,7 @@ class Clips:
         """Return moved frames as clips; values of a whole clip, such as its camera, are returned once."""
         result = dict(moved)
         for name, value in moved.items():
-            if name in self.per_clip:
+            if name in self.per_clip and value is not None:
                 rows = list(range(0, len(value), self.shape[1]))
                 result[name] = [value[i] for i in rows] if isinstance(value, list) else value[rows]
             elif value is not self.sample.get(name):

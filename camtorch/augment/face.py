@@ -136,8 +136,9 @@ class FaceNormalizer(SampleTransform):
         sample = self._given(sample, fields)
         batch = self._batch(sample)
         camera = batch.camera
-        if not isinstance(sample.get("camera", camera), (Camera, Guess)):
-            raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(sample['camera'])}")
+        given = sample.get("camera")
+        if not (given is None or isinstance(given, (Camera, Guess))):
+            raise TypeError(f"{self._name}: camera must be a Camera; got {no_camera(given)}")
         named = batch.rows()
         values = {name: value for name, (_, value) in named.items()}
         found = self._head(values)
@@ -151,7 +152,7 @@ class FaceNormalizer(SampleTransform):
         scale = self.distance / centre.norm(dim=-1)
         moved["scale"] = scale if batch.plan.batched else scale.squeeze(0)
         moved["source_camera"] = camera.clone()
-        if "rotation" in sample:  # by earlier augmentations
+        if sample.get("rotation") is not None:  # by earlier augmentations
             moved["source_rotation"] = sample["rotation"].clone()
         return moved
 
@@ -174,7 +175,7 @@ class FaceNormalizer(SampleTransform):
         augmentations), and any other fields: gaze, keypoints, 3D points, images.
         """
         sample = self._given(sample, fields)
-        if missing := [name for name in ("camera", "rotation", "source_camera") if name not in sample]:
+        if missing := [name for name in ("camera", "rotation", "source_camera") if sample.get(name) is None]:
             raise ValueError(f"{self._name}: a sample to move back must have {', '.join(missing)}; got none")
         normal, source, rotation = (sample.pop(name) for name in ("camera", "source_camera", "rotation"))
         batch = self._batch(sample, normal, predicted=True)

@@ -131,7 +131,7 @@ class Transform(FrontEnd):
                 if moved.keys() >= way.names:  # a face is moved back without its rotation
                     result[name] = way.write(moved, sample[name])
             for name, value in moved.items():
-                if name not in tensors or name == PLACE:
+                if tensors.get(name) is None or name == PLACE:
                     value = plain(value) if isinstance(value, Tensor) else value
                     result[name] = value[0] if name.endswith(_VALID) and value.ndim == 3 else value
             return result

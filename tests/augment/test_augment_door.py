@@ -3,12 +3,14 @@
 import math
 import re
 
+import numpy as np
 import PIL.Image
 import pytest
 import torch
 
 import camtorch as ct
-from camtorch.augment import PRESETS, RandomCamera, RandomLens, RandomMount, outlines
+import camtorch.augment.numpy
+from camtorch.augment import PRESETS, FaceNormalizer, HorizontalFlip, RandomCamera, RandomLens, RandomMount, outlines
 
 SIZE, POINTS = (30, 40), torch.zeros(2, 5, 2)
 
@@ -229,7 +231,7 @@ def test_each_star_of_a_pattern_stands_for_any_characters(camera):
 
 @pytest.mark.parametrize("name", ["camera", "rotation", "crop_place", "scale", "source_camera", "source_rotation"])
 def test_fields_gives_no_kind_to_what_a_transform_returns(camera, name):
-    transforms = {RandomMount: 3, ct.CanonicalCamera: 5, ct.augment.FaceNormalizer: 6}  # how many they return
+    transforms = {RandomMount: 3, ct.CanonicalCamera: 5, FaceNormalizer: 6}  # how many they return
     names = ["camera", "rotation", "crop_place", "scale", "source_camera", "source_rotation"]
     for transform, count in transforms.items():
         options = {"focal": 500.0} if transform is ct.CanonicalCamera else {}
@@ -248,3 +250,34 @@ def test_kinds_that_are_set_later_are_checked(camera):
         mount.fields[key] = "pts"
         with pytest.raises(ValueError, match=f"fields must map names to image,.*got {{'{re.escape(key)}': 'pts'}}"):
             mount(keypoints=POINTS, **{name: torch.ones(2, 9, 3)})
+
+
+NONE = dict.fromkeys(("camera", "rotation", "crop_place", "source_rotation", "keypoints"))
+POSE = {"rvec": torch.zeros(3), "tvec": torch.tensor([0.0, 0.0, 600.0])}
+MOUNT = RandomMount(yaw=(5, 5), pitch=None, roll=None)
+
+
+@pytest.mark.parametrize("transform", [HorizontalFlip(p=1.0), MOUNT, FaceNormalizer(image_size=SIZE)])
+@pytest.mark.parametrize("form", ["single", "clips", "arrays"])
+def test_none_stands_for_a_field_that_is_not_given(camera, transform, form):
+    image = torch.rand(3, *SIZE)
+    image = {"single": image, "clips": image.expand(1, 2, -1, -1, -1), "arrays": image.movedim(0, -1).numpy()}[form]
+    fields = {"image": image}
+    if isinstance(transform, FaceNormalizer):
+        if form == "clips":
+            pytest.skip("faces of frames are normalised one by one")
+        fields |= {name: value.numpy() if form == "arrays" else value for name, value in POSE.items()}
+    if not isinstance(transform, HorizontalFlip):
+        transform.camera = camera
+    move = ct.augment.numpy.Transform(transform) if form == "arrays" else transform
+    out, want = move(fields), move({**fields, **NONE})
+    known = {name: value for name, value in want.items() if value is not None}
+    assert known.keys() == out.keys()
+    back = move.inverse(want)
+    assert np.array_equal(back["image"], move.inverse(out)["image"])
+    assert all(np.array_equal(known[name], value) for name, value in out.items() if "camera" not in name)
+
+
+def test_a_face_needs_more_than_none_to_go_back(camera):
+    with pytest.raises(ValueError, match="must have camera, rotation; got none"):
+        FaceNormalizer().inverse(gaze=torch.rand(3), camera=None, rotation=None, source_camera=camera)
