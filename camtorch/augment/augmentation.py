@@ -112,10 +112,17 @@ class Augmentation(SampleTransform):
         **options: Unpack[SampleOptions],
     ):
         super().__init__(**options)
-        self.p = as_part(p, "p", self._name, "probability")
+        self.p = p
         self.same_on_batch = as_flag(same_on_batch, "same_on_batch", self._name)
         self.ranges = dict(ranges or {})
-        self.min_filled = None if min_filled is None else as_part(min_filled, "min_filled", self._name)
+        self.min_filled = min_filled
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "p":
+            value = as_part(value, name, self._name, "probability")
+        elif name == "min_filled" and value is not None:
+            value = as_part(value, name, self._name)
+        super().__setattr__(name, value)
 
     @property
     def last(self) -> Change | None:

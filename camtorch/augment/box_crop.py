@@ -7,7 +7,7 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
-from camtorch.augment.ranges import RangeLike, as_range
+from camtorch.augment.ranges import TURN, RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.poses.rotations import mount_rotation
 from camtorch.values.arguments import as_flag, as_known_size, as_whole
@@ -62,7 +62,7 @@ class BoxCrop(Augmentation):
     ):
         name = type(self).__name__
         turns = {"yaw": yaw, "pitch": pitch, "roll": roll}
-        ranges = {n: as_range(v, n, name, least=-180, most=180) for n, v in turns.items() if v is not None}
+        ranges = {n: as_range(v, n, name, **TURN) for n, v in turns.items() if v is not None}
         if zoom is not None:
             ranges["zoom"] = as_range(zoom, "zoom", name, around=1, least=1e-3, most=1e3)
         super().__init__(ranges, min_filled=0, **options)  # a box at the rim of the image is intended

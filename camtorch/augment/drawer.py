@@ -18,7 +18,7 @@ from camtorch.augment.filling import enough, scaled, tell_of_narrow_images
 from camtorch.augment.jitter import jittered
 from camtorch.augment.native_draws import DRAWN_KINDS, Start, Wanted, too_wide
 from camtorch.augment.presets import REAL, as_like
-from camtorch.augment.ranges import Draw, Range, RangeLike, as_range, as_tensors, values_for
+from camtorch.augment.ranges import TURN, Draw, Range, RangeLike, as_range, as_tensors, values_for
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import hold_numbers, known_false, with_derivatives_of
@@ -37,14 +37,14 @@ Auto = RangeLike | Literal["auto"] | None
 _TURNS = "yaw", "pitch", "roll"
 _TINY, _HUGE = 1e-3, 1e3
 _LIMITS: dict[str, dict[str, Any]] = {
-    **{name: {"least": -180, "most": 180} for name in _TURNS},
+    **dict.fromkeys(_TURNS, TURN),
     "zoom": {"least": _TINY, "most": _HUGE, "around": 1},
     "lens": {},
-    "fov": {"least": _TINY, "most": 360},
+    "fov": {"least": _TINY, "most": 360, "is_pair": True},
     "focal": {"least": _TINY, "most": _HUGE, "around": 1},
     "centre": {"least": -1, "most": 1, "size": DRAWN_KINDS["centre"][1]},
     "distortion": {"least": -1, "most": 1, "size": DRAWN_KINDS["distortion"][1]},
-    "crop": {"least": _TINY, "most": 1},
+    "crop": {"least": _TINY, "most": 1, "is_pair": True},
     "place": {"size": DRAWN_KINDS["place"][1]},
     "chromatic": {"least": -0.5, "most": 0.5, "size": 2},
     "vignetting": {"least": 0, "most": 1},

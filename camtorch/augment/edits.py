@@ -162,9 +162,9 @@ class RandomResizedCrop(Edit):
         **options: Unpack[EditOptions],
     ):
         name = type(self).__name__
-        ratios = as_range(ratio, "ratio", name, least=1e-3, most=1e3)
+        ratios = as_range(ratio, "ratio", name, least=1e-3, most=1e3, is_pair=True)
         ranges = {
-            "scale": as_range(scale, "scale", name, least=1e-6, most=1.0),
+            "scale": as_range(scale, "scale", name, least=1e-6, most=1.0, is_pair=True),
             "ratio": Range(math.log(ratios.low), math.log(ratios.high)),
             "place": Range(0, 1, 2),
         }

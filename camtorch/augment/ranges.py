@@ -34,6 +34,8 @@ POSITIVE = frozenset({"zoom", "fov", "focal", "crop"})
 """Names of ranges whose numbers make no camera unless they are positive."""
 
 Spans = SimpleNamespace  # by that name pickles of 0.4.0 have one that nothing reads
+TURN: dict[str, Any] = {"least": -180, "most": 180, "degrees": "degrees"}
+"""The options of `as_range` for turns."""
 _RADIANS = 0.8  # 45 degrees: a range of degrees within it is more likely in radians
 
 
@@ -72,8 +74,14 @@ def as_range(
     least: float = -math.inf,
     most: float = math.inf,
     size: int | None = None,
+    is_pair: bool = False,
+    degrees: str = "",
 ) -> Range:
-    """Return a checked range of (low, high); a single number x is that from `around` - x to `around` + x."""
+    """Return a checked range of (low, high); a single number x is that from `around` - x to `around` + x.
+
+    is_pair: whether a single number is refused. degrees: the unit in words, if it is one of degrees: numbers that seem
+    to be radians are warned of.
+    """
     try:
         if isinstance(value, Iterable) and not isinstance(value, str):
             low, high = map(float, value)
@@ -86,14 +94,14 @@ def as_range(
         raise ValueError(f"{owner}: {name} must be finite; got {value!r}")
     if low > high:
         raise ValueError(f"{owner}: {name} must be (low, high) with low <= high; got {value!r}")
-    if around == 0 and least > 0 and not isinstance(value, Iterable):
+    if is_pair and not isinstance(value, Iterable):
         raise TypeError(f"{owner}: {name} must be a range (low, high); got {value!r}")
     if low < least or high > most:
         means = "" if isinstance(value, Iterable) else f", which stands for ({low:g}, {high:g})"
         raise ValueError(f"{owner}: {name} must lie within [{least:g}, {most:g}]; got {value!r}{means}")
-    if most == 180 and 0 < max(-low, high) < _RADIANS:
+    if degrees and 0 < max(-low, high) < _RADIANS:
         warn(
-            f"{owner}: {name} is in degrees, and {shown(value)} seems to be radians. math.degrees() converts them; a "
+            f"{owner}: {name} is in {degrees}, and {shown(value)} seems to be radians. math.degrees() converts them; a "
             "range of less than a degree is taken as it is"
         )
     return Range(low, high, size)

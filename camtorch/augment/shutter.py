@@ -41,7 +41,7 @@ class RandomShutter(Augmentation):
         name = type(self).__name__
         readout = (readout, readout) if isinstance(readout, (int, float)) else readout
         ranges = {
-            "rates": as_range(rates, "rates", name, least=-3600, most=3600, size=3),
+            "rates": as_range(rates, "rates", name, least=-3600, most=3600, size=3, degrees="degrees per second"),
             "readout": as_range(readout, "readout", name, least=-1, most=1),
         }
         super().__init__(ranges, min_filled=0, **options)  # only the rim may be empty

@@ -252,6 +252,20 @@ def test_kinds_that_are_set_later_are_checked(camera):
             mount(keypoints=POINTS, **{name: torch.ones(2, 9, 3)})
 
 
+def test_what_is_set_later_is_checked_as_by_the_constructor(camera):
+    mount = RandomMount(camera=camera, p=0.5)
+    for name, value, text in (
+        ("p", 7, r"RandomMount: p must be a probability in \[0, 1\]; got 7"),
+        ("p", "half", "RandomMount: p must be a number"),
+        ("min_filled", -3, r"RandomMount: min_filled must be a part in \[0, 1\]; got -3"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=text):
+            setattr(mount, name, value)
+    assert (mount.p, mount.min_filled) == (0.5, None)
+    mount.p, mount.min_filled = 1, 0.5
+    assert mount(keypoints=POINTS)["keypoints"].shape == POINTS.shape
+
+
 NONE = dict.fromkeys(("camera", "rotation", "crop_place", "source_rotation", "keypoints"))
 POSE = {"rvec": torch.zeros(3), "tvec": torch.tensor([0.0, 0.0, 600.0])}
 MOUNT = RandomMount(yaw=(5, 5), pitch=None, roll=None)

@@ -290,6 +290,7 @@ CALLS = {
         NARROW.state_dict()
     ),
     "yaw is in degrees, and 0.3 seems": lambda: ct.augment.RandomMount(yaw=0.3),
+    "rates is in degrees per second, and 0.3 seems": lambda: ct.augment.RandomShutter(0.01, rates=0.3),
     "as .width, height., but .* middle of .640, 480.": lambda: ct.loads(
         {"K": NARROW.K.tolist(), "image_size": [480, 640]}
     ),
