@@ -12,11 +12,12 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.cameras import known_camera
-from camtorch.augment.change import Change, Part, by_models, check_sizes, one_or_batch
+from camtorch.augment.change import Change, by_models, check_sizes, one_or_batch
 from camtorch.augment.devices import Elsewhere, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
 from camtorch.augment.filling import enough, scaled, warn_if_empty, warn_of_unfilled
 from camtorch.augment.matrices import Guess
+from camtorch.augment.part import Part
 from camtorch.augment.ranges import (
     Draw,
     Range,

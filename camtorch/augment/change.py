@@ -4,30 +4,23 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, TypeVar
+from dataclasses import replace
+from typing import Any, TypeVar
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from camtorch.augment.part import Part
 from camtorch.cameras.camera import Camera
-from camtorch.cameras.editing import edited
 from camtorch.cameras.mixed import Mixed
-from camtorch.evaluate.tensors import are_numbers, known_false, known_true
-from camtorch.poses.rotations import is_right, turn
-from camtorch.projection.evaluation import camera_rows
-from camtorch.projection.native_cameras import Native
+from camtorch.evaluate.tensors import known_false, known_true
+from camtorch.poses.rotations import turn
 from camtorch.values.arguments import present, warn
 from camtorch.values.dtypes import narrow, widen
 from camtorch.values.module import remade
-from camtorch.warp.affine import AffineWarp, UncheckedWarp, after, made_like
 from camtorch.warp.boxes import corners_of, in_order
 from camtorch.warp.options import Mode, Options, as_fill
-from camtorch.warp.panorama import seam_of
-from camtorch.warp.warp import Warp
 
-_NO_TURN = np.eye(3)
 _HALF = 5e-3  # absolute: rotations that were half precision on the way are the same ones
 _ROUNDED, _ABSOLUTE = 1e-5, 1e-8  # relative and absolute: cameras that were float32 on the way are the same ones
 TensorOrPair = TypeVar("TensorOrPair", Tensor, tuple[Tensor, Tensor])
@@ -40,172 +33,6 @@ def _same(value: Tensor) -> Tensor:
 def as_is(camera: Camera, rows: Tensor) -> Tensor:
     """Return values of samples that nothing moves."""
     return rows
-
-
-@dataclass(slots=True)
-class LazyWarp:
-    """A warp to cameras of which native code wrote the numbers; warp and cameras become modules at first use."""
-
-    # what changes ask of a `Warp`, too
-    joins_earlier: ClassVar[bool] = False
-    moves_by_cameras: ClassVar[bool] = True
-    like: Camera  # the new cameras are of its model
-    intrinsics: np.ndarray[Any, Any]  # (4,) of one, or (B, 4)
-    distortion: np.ndarray[Any, Any]  # (n,) of one, or (B, n)
-    image_size: tuple[int, int]
-    rotation: Tensor | None  # (3, 3) or (B, 3, 3), or None
-    options: Options  # of the warp
-    source_native: Native | None  # the cameras before, for native code
-    target_native: Native | None  # the new cameras, for native code; None if it does not have them
-    zooms: Sequence[float] = ()  # (B,): the factors on focal lengths that `min_filled` asks for; empty if it does not
-    filled: Sequence[float] = ()  # (B,): the part of each image that is filled then
-    may_mirror: bool = False  # whether the rotation may be a mirror, as after a flip
-    _warp: Warp | None = field(default=None, init=False)  # `warp()`, once it was called
-    _target: Camera | None = field(default=None, init=False)  # `target`, once it was read
-
-    @property
-    def target(self) -> Camera:
-        """The new cameras of the change; samples get copies of them."""
-        if self._target is None:
-            if self.target_native is not None:
-                self.target_native.keep_lenses()  # the new camera finds them
-            self._target = self.new_target()
-        return self._target
-
-    def new_target(self, count: int | None = None) -> Camera:
-        """Return the new cameras, of memory of their own; a count makes a batch of a single one."""
-        if torch.is_inference_mode_enabled():  # a graph could not use its tensors later
-            with torch.inference_mode(False), torch.no_grad():
-                return self.new_target(count)
-        numbers, k = self.intrinsics, self.distortion
-        if count is not None:
-            numbers, k = (np.broadcast_to(each, (count, each.shape[-1])) for each in (numbers, k))
-        intrinsics, distortion = torch.from_numpy(numbers.copy()).as_subclass(nn.Parameter), torch.from_numpy(k.copy())
-        distortion = distortion.as_subclass(nn.Parameter) if k.shape[-1] else distortion
-        return remade(self.like, intrinsics=intrinsics, distortion=distortion, image_size=self.image_size)
-
-    def transform_positions(self, points: Tensor) -> Tensor:
-        """Return points (B, *N, 3) of the source's frame in the target's."""
-        return turn(self.rotation, points, "points")
-
-    def warp(self, source: Camera) -> Warp:
-        if self._warp is None:
-            self._warp = UncheckedWarp(source, self.target, self.rotation, **self.options)
-        return self._warp
-
-
-@dataclass(slots=True)
-class Part:
-    """Rows of a batch that move by one warp, or stay as they are."""
-
-    camera: Camera  # before the change; the warp's source
-    moves: Warp | LazyWarp | None = None  # what the rows move by; None if nothing happens to them
-    shades: tuple[Warp, Warp] | None = None  # how red and blue move, where they do not move as green
-    light: Tensor | None = None  # (n or 1, 1, H', W'): what the lens lets through
-    rows: list[int] | None = None  # which samples of the batch, or None for all
-
-    @property
-    def warp(self) -> Warp:
-        assert self.moves is not None
-        return self.moves.warp(self.camera) if isinstance(self.moves, LazyWarp) else self.moves
-
-    @property
-    def target(self) -> Camera:
-        return self.camera if self.moves is None else self.moves.target
-
-    @property
-    def rotation(self) -> Tensor | None:
-        """`ray_after = R ray_before`, (3, 3) or (n, 3, 3); None where nothing turns."""
-        return None if self.moves is None else self.moves.rotation
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """(height, width) after the change."""
-        return self.camera.size_for("Warp") if self.moves is None else self.moves.image_size
-
-    def with_warps(self, change: Callable[[Warp], Warp]) -> Part:
-        """Return the part with each of its warps changed."""
-        shades = None if self.shades is None else (change(self.shades[0]), change(self.shades[1]))
-        return replace(self, moves=None if self.moves is None else change(self.warp), shades=shades)
-
-    def with_options(self, options: Options) -> Part:
-        """Return the part with its warps made anew by other options."""
-        if isinstance(self.moves, LazyWarp):
-            return replace(self, moves=replace(self.moves, options=options))
-
-        def optioned(warp: Warp) -> Warp:
-            if warp.options == options:
-                return warp
-            return made_like(warp, warp.source, warp.target, warp.rotation, options)
-
-        return self.with_warps(optioned)
-
-    def take(self, index: list[int]) -> Part:
-        """Return these rows of the part as a part of its own."""
-
-        def of(camera: Camera) -> Camera:
-            return camera[index] if camera.batch_shape else camera  # a single one serves all rows
-
-        def taken(warp: Warp) -> Warp:
-            rotation = warp.rotation if warp.rotation is None or warp.rotation.ndim == 2 else warp.rotation[index]
-            return warp.rows_of(camera, of(warp.target), rotation, index)
-
-        camera, light = of(self.camera), self.light
-        light = light if light is None or len(light) == 1 else light[index]
-        return replace(self.with_warps(taken), rows=None, camera=camera, light=light)
-
-    def then(self, second: Part) -> Part:
-        """Return one part that does with one warp what this and another one of the same rows do in turn."""
-        first, last = self.moves, second.moves
-        if last is None:
-            return self
-        if first is None:
-            return replace(second, camera=self.camera)
-        if last.joins_earlier:
-            made = second.warp
-            return self.with_warps(lambda warp: made.between(warp.source, warp.target, warp.rotation, **made.options))
-        rotation = _turned(first.rotation, last.rotation)
-        if isinstance(last, AffineWarp):
-            return self._edited(last, rotation)
-        if self.shades is not None or self.light is not None:
-            raise ValueError(
-                "Compose: chromatic and vignetting must be those of the last lens of a chain; got an earlier one, "
-                "whose colours or light would be seen through another lens"
-            )
-        are_known = rotation is None or are_numbers(rotation)  # else the rotation may learn
-        if isinstance(last, LazyWarp) and are_known and not self.camera.batch_shape:
-            native = first.source_native if isinstance(first, LazyWarp) else _single(self.camera)
-            may_mirror = rotation is not None and (rotation.ndim > 2 or not is_right(rotation))
-            moves = replace(last, rotation=rotation, source_native=native, may_mirror=may_mirror)
-            return replace(second, camera=self.camera, moves=moves)
-        moved = second.with_warps(lambda warp: UncheckedWarp(self.camera, warp.target, rotation))
-        return replace(moved, camera=self.camera)
-
-    def _edited(self, edit: AffineWarp, rotation: Tensor | None) -> Part:
-        """Return this part, then an edit, as one part; the rotation is that of both."""
-        size = edit.target.image_size
-        if isinstance(self.moves, AffineWarp):
-            matrix = after(edit.map, self.moves.map)
-            return replace(self, moves=AffineWarp(self.camera, edited(self.camera, matrix, size), matrix, rotation))
-        light = None if self.light is None else edit(self.light, padding_mode="border")
-        moved = self.with_warps(lambda warp: UncheckedWarp(self.camera, edited(warp.target, edit.map, size), rotation))
-        return replace(moved, light=light)
-
-
-def _turned(first: Tensor | None, second: Tensor | None) -> Tensor | None:
-    """Return the rotation (3, 3) or (B, 3, 3) of two in turn; None is none."""
-    if first is None or second is None:
-        return second if first is None else first
-    dtype = torch.promote_types(first.dtype, second.dtype)
-    return (second.to(dtype).unsqueeze(-1) * first.to(dtype).unsqueeze(-3)).sum(-2)
-
-
-def _single(camera: Camera) -> Native | None:
-    """Return a single camera for native code; None if it cannot evaluate it."""
-    if seam_of(camera) is not None or not are_numbers(*camera.tensors):
-        return None
-    rows = camera_rows(camera, *camera.tensors)
-    return rows.native if rows.usable is None else None
 
 
 def _renamed(old: str, method: str, batched: bool) -> Any:
@@ -289,26 +116,16 @@ class Change:
     def camera_for_sample(self, batched: bool) -> Camera:
         """Return a copy of the cameras after, or of the one of a change of one sample: a sample's, not the change's."""
         first = self.parts[0]
-        moves = first.moves
-        if isinstance(moves, LazyWarp):
-            if not batched and moves.intrinsics.ndim == 1:
-                return moves.new_target()
-            if batched and first.rows is None and not self.mixed:
-                return moves.new_target(None if moves.intrinsics.ndim == 2 else self.count)
-        if batched or self.gate is not None:
-            return (self.target if batched else self.target[0]).clone()
-        return one_or_batch(first.target).clone()
+        if first.motion is not None and first.rows is None and self.gate is None:
+            return first.motion.new_target((self.count,) if batched else ())
+        return (self.target if batched else self.target[0]).clone()
 
     def rotation_for_sample(self, batched: bool) -> Tensor:
         """Return a copy of the rotations (count, 3, 3), or of the one (3, 3) of a change of one sample."""
-        moves = self.parts[0].moves
-        rotation = None if moves is None else moves.rotation
+        motion = self.parts[0].motion
+        rotation = None if motion is None else motion.rotation
         if batched or self.gate is not None or (rotation is not None and rotation.ndim > 2):
             return (self.rotation if batched else self.rotation[0]).clone()
-        if isinstance(moves, LazyWarp):
-            if rotation is None:
-                return torch.from_numpy(_NO_TURN.astype(moves.intrinsics.dtype))
-            return torch.from_numpy(rotation.numpy().copy())  # in less time than a clone
         return _eye(self.parts[0].camera.intrinsics) if rotation is None else rotation.clone()
 
     several: Camera = _renamed("several", "camera_for_sample", batched=True)
@@ -326,7 +143,7 @@ class Change:
     @property
     def mirrored(self) -> Tensor | None:
         """(count,) bool: which samples are seen in a mirror; None if none is."""
-        turns = [part.rotation if part.moves is not None and part.moves.may_mirror else None for part in self.parts]
+        turns = [part.rotation if part.motion is not None and part.motion.may_mirror else None for part in self.parts]
         if all(turn is None for turn in turns):
             return None
         x, y, z = self._turns(turns).unbind(-2)
@@ -409,7 +226,7 @@ class Change:
         if self._inverse is not None:  # its warps hold the maps that they have made
             return self._inverse
         parts = [
-            part if part.moves is None else Part(part.target, part.warp.inverse(), rows=part.rows)
+            part if part.motion is None else Part(part.target, part.warp.inverse(), rows=part.rows)
             for part in self.parts
         ]
         self._inverse = self._with_parts(parts)
@@ -425,8 +242,8 @@ class Change:
 
         def of(part: Part) -> TensorOrPair:
             # results share no memory with values that the caller passed
-            rows = value[part.rows] if part.rows is not None else value.clone() if part.moves is None else value
-            return stay(part.camera, rows) if part.moves is None else move(part, rows)
+            rows = value[part.rows] if part.rows is not None else value.clone() if part.motion is None else value
+            return stay(part.camera, rows) if part.motion is None else move(part, rows)
 
         results = [of(part) for part in self.parts]
         gate = self.gate
@@ -529,8 +346,8 @@ class Change:
         """Move points (count, *N, 3) of the camera frame: they turn, and shift if the camera moves."""
 
         def move(part: Part, rows: Tensor) -> Tensor:
-            assert part.moves is not None
-            moved = part.moves.transform_positions(rows)
+            assert part.motion is not None
+            moved = part.motion.transform_positions(rows)
             return moved.clone() if moved is rows else moved
 
         return self.each(points, move)

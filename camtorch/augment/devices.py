@@ -9,7 +9,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Change, Part, TensorOrPair, as_is
+from camtorch.augment.change import Change, TensorOrPair, as_is
+from camtorch.augment.part import Part
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.devices import may_read, on_cpu, remember, sent
@@ -114,12 +115,12 @@ def _remade(parts: Sequence[Part], change: Callable[[list[Tensor]], list[Tensor]
         for host, target in zip([part.warp, *(part.shades or ())], targets, strict=True) if targets else ():
             warps.append(made_like(host, source, target, rotation, host.options).follow_host(host))
         shades = (warps[1], warps[2]) if part.shades else None
-        made.append(replace(part, moves=warps[0] if warps else None, camera=source, shades=shades, light=light))
+        made.append(replace(part, motion=warps[0] if warps else None, camera=source, shades=shades, light=light))
     return made
 
 
 def _cameras(part: Part) -> list[Camera]:
     """Return the cameras of a part: before, and after, of each colour."""
-    if part.moves is None:
+    if part.motion is None:
         return [part.camera]
     return [part.camera, part.target, *(warp.target for warp in part.shades or ())]

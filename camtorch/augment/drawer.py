@@ -12,11 +12,11 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
-from camtorch.augment.change import Part
 from camtorch.augment.devices import twin_of
 from camtorch.augment.filling import enough, scaled, tell_of_narrow_images
 from camtorch.augment.jitter import jittered
 from camtorch.augment.native_draws import DRAWN_KINDS, Start, Wanted, too_wide
+from camtorch.augment.part import Part
 from camtorch.augment.presets import REAL, as_like
 from camtorch.augment.ranges import TURN, Draw, Range, RangeLike, as_range, as_tensors, values_for
 from camtorch.cameras.camera import Camera
@@ -170,7 +170,7 @@ class CameraDrawer(Augmentation):
             if not are_filled or max(made.zooms, default=1) > 1:
                 self._tell_of(source, lambda: made.target, torch.tensor([*made.zooms]), torch.tensor([*made.filled]))
         options = self.options
-        may_stay_lazy = made.target_native is not None and options["tolerance"] and not options["antialias"]
+        may_stay_lazy = made.natives is not None and options["tolerance"] and not options["antialias"]
         if may_stay_lazy and self.beside_the_camera.isdisjoint(self.ranges):
             return Part(source, made)  # of numbers, which become a `Warp` at first use
         return self._part_between(source, made.target, made.rotation, values)

@@ -13,8 +13,9 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions, FlipOptions
-from camtorch.augment.change import Change, Part, by_models
+from camtorch.augment.change import Change, by_models
 from camtorch.augment.landmarks import Mirroring, TableLike
+from camtorch.augment.part import Part
 from camtorch.augment.ranges import Draw, Range, as_range, rows_of
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.editing import edited, quarter_turns

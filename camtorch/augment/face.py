@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 from typing_extensions import Unpack
 
-from camtorch.augment.change import Change, Part, one_or_batch
+from camtorch.augment.change import Change, one_or_batch
 from camtorch.augment.fields import PLACE
 from camtorch.augment.matrices import Guess
+from camtorch.augment.part import Part
 from camtorch.augment.sample import Sample, SampleOptions, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import known_false

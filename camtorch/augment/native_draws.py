@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import LazyWarp
 from camtorch.augment.filling import looked_at, with_care
 from camtorch.augment.jitter import border, lens_ends, measured_once, sensitivity
+from camtorch.augment.part import LazyWarp
 from camtorch.cameras.camera import Camera
 from camtorch.native import structs
 from camtorch.native.library import loaded
@@ -205,11 +205,10 @@ class Start:
             rotation = torch.from_numpy(numbers[turns:jittered].reshape(*batch, 3, 3))
         if self._lenses_by != "base":
             k = numbers[jittered : jittered + rows * call.count].reshape(*batch, call.count)
-        native: Native | None = None
-        if self._is_flat and not left:
-            native = self._native(call, room, intrinsics, k)
+        native = self._native(call, room, intrinsics, k) if self._is_flat and not left else None
+        natives = None if native is None else (self._source_native, native)
         like = source if self._keeps_lens else self.base
-        return LazyWarp(like, intrinsics, k, self._size, rotation, options, self._source_native, native, zooms, filled)
+        return LazyWarp(like, intrinsics, k, self._size, rotation, options, natives, zooms, filled)
 
     def _packed(self, values: Mapping[str, Any]) -> tuple[Any, tuple[int, ...]]:
         """Return drawn values kind after kind, as C takes them, and (B,); () for numbers and lists of one camera."""

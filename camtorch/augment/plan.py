@@ -1,4 +1,12 @@
-"""The form of samples, and its plan: which fields move, whether there is a dim B, and the call of C for most."""
+"""How a sample moves by a change: all that is the same for samples of one form is planned once.
+
+1. `form_of` says what a plan depends on. A sample that has no form, as one of lists, or in traced code, has a plan of
+   its own. The plan is kept by the form, and `_new_batch` in `sample.py` makes it.
+2. A `SamplePlan` names the fields that move, and whether there is a dim B. A `Batch` is a sample with its plan.
+3. `SamplePlan.together` moves what it can by one call of C, also kept: images and pixels of samples that all move by
+   one warp, if nothing is recorded. Of a single sample whose camera C drew, it moves most other labels, too.
+4. `Batch.moved` moves each other field by itself: `move` calls what the table `KINDS` has for its kind.
+"""
 
 import functools
 import math
@@ -10,16 +18,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Change, LazyWarp, Part
+from camtorch.augment.change import Change
 from camtorch.augment.fields import KINDS, Named, field_of
+from camtorch.augment.part import Part
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_free, are_numbers, known_true
 from camtorch.native.library import native_available
 from camtorch.native.structs import EDGE_POINTS
-from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import thread_count
-from camtorch.warp.at_once import Label, MovedField, SampleCall, call_for, natives_of
+from camtorch.warp.at_once import Label, MovedField, SampleCall, call_for
 from camtorch.warp.boxes import along_edges, around, corners_of, in_order
 from camtorch.warp.options import Options, Sampler
 
@@ -58,14 +66,11 @@ def form_of(
 
 
 class CallOfFields(NamedTuple):
-    """A call of C, and the names of the fields that it moves."""
+    """A call of C that moves several fields at once, and their names."""
 
     names: Sequence[str]
     narrowed: Sequence[str]  # of those, pixels and boxes that come out in another dtype than that of the cameras
-    call: SampleCall | None  # None if no call serves
-
-
-_NO_CALL = CallOfFields([], [], None)
+    call: SampleCall
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ class SamplePlan:
     masks: Sequence[str]  # names of the masks of validity that come out: "image_valid" and so on
     mask_fill: float
     calls: Kept | None
-    """Maps settings to the `CallOfFields`; None if autograd may record."""
+    """Maps settings to the `CallOfFields`, or to None if no call serves; None itself if autograd may record."""
 
     def rows(self, value: Any) -> Any:
         """Return a value with a dim B; a list has one already."""
@@ -88,50 +93,46 @@ class SamplePlan:
     def together(self, change: Change, values: Mapping[str, Any]) -> Mapping[str, MovedField | None]:
         """Move by one call of C: images, pixels, and of a single sample whose camera C drew also boxes and rays.
 
-        A `LazyWarp` goes to such a camera; other warps move images and pixels alone. Without the library, pixels and
-        boxes move by one evaluation in torch. The other fields, and all of them if no call serves, are not in the
-        result, or None.
+        A `LazyWarp` goes to such a camera. Without the library, pixels and boxes move by one evaluation in torch. The
+        other fields, and all of them if no call serves, are not in the result, or None.
         """
         part, calls = change.parts[0], self.calls
-        moves = part.moves
-        # One call moves all rows by one warp, and records nothing
-        if calls is None or moves is None or part.rows is not None or change.gate is not None or not self.count:
+        motion = part.motion
+        # 1. One call moves all rows by one warp, and records nothing
+        if calls is None or motion is None or part.rows is not None or change.gate is not None or not self.count:
             return {}
         if not native_available():
             return self._pixels_at_once(part, values)
-        source: Native | None
-        target: Native | None
-        labels: Sequence[Label] = ()
-        if isinstance(moves, LazyWarp):
-            source, target, rotation = moves.source_native, moves.target_native, moves.rotation
-            if self.count == 1:
-                labels = _LABELS_OF_MIRRORS if moves.may_mirror else _LABELS_OF_TURNS
-        else:
-            # Images whose colours or light change move on their own; of a `Warp` only images and pixels move here
-            natives = None if part.shades or part.light is not None else natives_of(moves)
-            if natives is None:
-                return {}
-            source, target, rotation = natives
-        if source is None or target is None:  # C lacks a model
+        # 2. C needs both cameras, and a camera, or a turn, for each row; images whose colours or light change go alone
+        natives = None if part.shades or part.light is not None else motion.natives
+        if natives is None:
             return {}
-        if self.count > 1:  # C takes a camera, or a turn, for each row
+        source, target = natives
+        rotation = motion.rotation
+        if self.count > 1:
             turns = 1 if rotation is None else rotation.numel() // 9
             if self.count not in (source.cameras, target.cameras, turns):
                 return {}
-        # The call is kept by all that it depends on, beside the form
-        size = moves.image_size
-        settings = size, source.dtype, labels, thread_count(), *moves.options.values()
+        # 3. The call is kept by all that it depends on, beside the form
+        labels: Sequence[Label] = ()
+        if motion.is_drawn and self.count == 1:
+            labels = _LABELS_OF_MIRRORS if motion.may_mirror else _LABELS_OF_TURNS
+        size = motion.image_size
+        settings = size, source.dtype, labels, thread_count(), *motion.options.values()
         known = calls.entry((), settings)
         if known is None:
-            new = functools.partial(self._new_call, values, part.camera, size, source.dtype, moves.options, labels)
-            names, narrowed, call = calls((), settings, new)
+            new = functools.partial(self._new_call, values, part.camera, size, source.dtype, motion.options, labels)
+            kept: CallOfFields | None = calls((), settings, new)
         else:
-            names, narrowed, call = known.result
-        moved = None if call is None else call(source, target, rotation, [*map(values.__getitem__, names)])
+            kept = known.result
+        if kept is None:
+            return {}
+        # 4. The call moves its fields, or refuses the values
+        moved = kept.call(source, target, rotation, [*map(values.__getitem__, kept.names)])
         if moved is None:
             return {}
-        results = dict(zip(names, moved, strict=True))
-        for name in narrowed:
+        results = dict(zip(kept.names, moved, strict=True))
+        for name in kept.narrowed:
             pair = results[name]
             if pair is not None:
                 results[name] = _in_range(pair[0], values[name].dtype), pair[1]
@@ -145,8 +146,8 @@ class SamplePlan:
         dtype: torch.dtype,
         options: Options,
         labels: Sequence[Label],
-    ) -> CallOfFields:
-        """Return the call of C that moves several fields.
+    ) -> CallOfFields | None:
+        """Return the call of C that moves several fields; None if no call serves.
 
         camera, size: of the images, and of the new ones. dtype, options: as of `call_for`. labels: those that it moves
         beside pixels.
@@ -155,15 +156,18 @@ class SamplePlan:
         for name, kind in self.fields.items():
             value = values[name]
             if isinstance(value, list) or field_of(kind, value).by_c == "never":
-                return _NO_CALL
+                return None
             how = self._how_of(kind, value, dtype, options, labels)
             if how is not None:
                 hows[name] = how
         if not hows:
-            return _NO_CALL
+            return None
         sizes, chosen = (camera.size_for("Warp"), size), [values[name] for name in hows]
+        call = call_for(sizes, dtype, options, chosen, [*hows.values()], self.batched)
+        if call is None:
+            return None
         narrowed = [name for name, how in hows.items() if how in ("pixels", "boxes") and values[name].dtype != dtype]
-        return CallOfFields([*hows], narrowed, call_for(sizes, dtype, options, chosen, [*hows.values()], self.batched))
+        return CallOfFields([*hows], narrowed, call)
 
     def _how_of(
         self, kind: str, value: Tensor, dtype: torch.dtype, options: Options, labels: Sequence[Label]

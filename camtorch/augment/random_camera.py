@@ -9,9 +9,9 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.change import Part
 from camtorch.augment.drawer import Auto, CameraDrawer, LensOptions
 from camtorch.augment.fields import Named
+from camtorch.augment.part import Part
 from camtorch.augment.presets import PresetName
 from camtorch.augment.ranges import Draw, RangeLike, as_range
 from camtorch.cameras.camera import Camera
@@ -181,7 +181,7 @@ class RandomMount(CameraDrawer):
         depth = as_depth(draw[key], kind, source.size_for(self._name), self._name, draw[key].device)
         turned = part.warp.rotation
         warp = ShiftedWarp(source, part.target, turned, depth, kind, shift, self._name, **self._warp_options)
-        return replace(part, moves=warp)
+        return replace(part, motion=warp)
 
 
 class RandomLens(CameraDrawer):

@@ -7,7 +7,7 @@ import torch
 from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
-from camtorch.augment.change import Part
+from camtorch.augment.part import Part
 from camtorch.augment.ranges import Draw, RangeLike, as_range, as_tensors, values_for
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import one_of

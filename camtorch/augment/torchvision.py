@@ -140,7 +140,7 @@ class Transform(FrontEnd, v2.Transform):
         def write(moved: Sample, change: Change) -> Any:
             part = change.parts[0]
             for i, field in fields.items():  # where nothing moves, PIL images and tv_tensors stay as they are
-                if part.moves is not None or not field.kind or type(leaves[i]) in _HELD:
+                if part.motion is not None or not field.kind or type(leaves[i]) in _HELD:
                     leaves[i] = field.write(moved[keys[i]], part.image_size)
             for i in cameras:
                 leaves[i] = moved["camera"]

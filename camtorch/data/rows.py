@@ -8,11 +8,11 @@ import numpy as np
 from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.change import Part
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.fields import IMAGES, KEEP, KINDS
 from camtorch.augment.names import kind_of
 from camtorch.augment.numpy import Transform
+from camtorch.augment.part import Part
 from camtorch.augment.sample import Sample
 from camtorch.cameras.camera import Camera
 from camtorch.data.columns import PARTS, camera_of, to_columns

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
-from camtorch.augment.change import Change, Part, by_models, one_or_batch
+from camtorch.augment.change import Change, by_models, one_or_batch
+from camtorch.augment.part import Part
 from camtorch.augment.plan import Batch
 from camtorch.augment.sample import Sample, SampleTransform, on_samples
 from camtorch.cameras.camera import Camera

@@ -16,13 +16,11 @@ from camtorch.evaluate.kept import Kept
 from camtorch.native import memory, structs
 from camtorch.native.library import loaded
 from camtorch.native.sampler import describe, is_quick, maker, takes, tiles_of
-from camtorch.projection.evaluation import native_forms
 from camtorch.projection.native_calls import Lattices, NativeMove, run_and_follow
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 from camtorch.warp.lattice import FEWEST_CELLS, MOST_KEPT_NODES, coarse, probes
 from camtorch.warp.options import Options, Sampler, serving_all
-from camtorch.warp.routes import RoutedWarp
 from camtorch.warp.sampling import SHRINKS, SURELY
 
 Label = Literal["pixels", "boxes", "rays", "columns", "pose", "rotation vectors"]
@@ -38,16 +36,6 @@ _FORMS = {"pose": structs.POSE, "rotation vectors": structs.ROTATION_VECTORS}  #
 _TILES_FOR_ONE_THREAD = 2  # an image of no more is made by one
 _SAMPLES_PER_THREAD = 4  # with as many, threads that idle at the end matter little
 _FLAGS_OF_PIXELS = 1 << structs.LEFT_BITS  # flags of pixels stand above those of the lattice
-
-
-def natives_of(warp: RoutedWarp) -> tuple[Native, Native, Tensor | None] | None:
-    """Return source, target and rotation of a warp for native code; None if it has to go step by step."""
-    pair = warp.pair
-    if not warp.moves_by_cameras or warp.is_pinned or pair.goes_round:
-        return None
-    source, target, rotation = pair
-    made = native_forms((source, target), target.intrinsics, *(() if rotation is None else (rotation,)))
-    return None if made is None else (*made[0], rotation)  # type: ignore[return-value]
 
 
 def call_for(

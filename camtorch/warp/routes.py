@@ -38,6 +38,8 @@ from camtorch.evaluate.export import with_values
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import is_unknown
 from camtorch.native.sampler import Call, maker
+from camtorch.projection.evaluation import native_forms
+from camtorch.projection.native_cameras import Native
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
 from camtorch.warp import compiled
@@ -98,6 +100,7 @@ class RoutedWarp(GeometryModule):
     joins_earlier: ClassVar[bool] = False  # True: after another warp both are one, `between` the cameras of that
     keeps_depth: ClassVar[bool] = False  # True: depths along the axis stay, as the camera does
     may_mirror: ClassVar[bool] = False  # True: the rotation may be a mirror
+    is_drawn: ClassVar[bool] = False  # True: it is of numbers that native code drew; then it turns labels, too
     source: Camera = _held_in("_modules", "source")
     target: Camera = _held_in("_modules", "target")
     rotation: Tensor | None = _held_in("_buffers", "rotation")
@@ -211,6 +214,21 @@ class RoutedWarp(GeometryModule):
         """The `pair` whose source is the camera of the images that are sampled, which `seam` may have lengthened."""
         pair, seam = self.pair, self.seam
         return pair if seam is None else pair._replace(source=seam.camera_of(pair.source))
+
+    @property
+    def natives(self) -> tuple[Native, Native] | None:
+        """Source and target for native code; None if the warp, also by its rotation, has to go step by step."""
+        pair = self.pair
+        if not self.moves_by_cameras or self.is_pinned or pair.goes_round:
+            return None
+        source, target, rotation = pair
+        made = native_forms((source, target), target.intrinsics, *(() if rotation is None else (rotation,)))
+        return None if made is None else (made[0][0], made[0][1])
+
+    def new_target(self, batch: tuple[int, ...]) -> Camera:
+        """Return a copy of the target, of batch dims (B,) or, of one camera, of none."""
+        target = self.target
+        return (target.expand(*batch) if batch or not target.batch_shape else target[0]).clone()
 
     def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Positions:
         """Return positions of some rows of the target, which serve a padding, within a tolerance."""

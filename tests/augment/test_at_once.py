@@ -286,7 +286,7 @@ def test_what_goes_at_once_makes_no_warp(name):
     camera, sample = example("brown_conrady", SIZE).requires_grad_(False), sample_for(torch.float32)
     augment = AUGMENTATIONS[name]()
     augment(sample, camera=camera)
-    assert augment.last.parts[0].moves._warp is None
+    assert augment.last.parts[0].motion._warp is None
 
 
 CHANGES = {

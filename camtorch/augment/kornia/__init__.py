@@ -25,12 +25,13 @@ from torch import Tensor
 from camtorch.augment import box_crop, compose, edits, random_camera
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import check_single, known_camera
-from camtorch.augment.change import Change, Part
+from camtorch.augment.change import Change
 from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.kornia.containers import wrap_containers
 from camtorch.augment.kornia.params import KIND, Params, camera_with_params, kind_of_camera, with_boxes, with_cameras
 from camtorch.augment.kornia.private import input_metadata_only, transform_output_shape
 from camtorch.augment.matrices import Guess
+from camtorch.augment.part import Part
 from camtorch.augment.sample import detached, on_samples
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import kind
@@ -271,12 +272,12 @@ def _state_key(augmentation: Augmentation) -> tuple[Any, ...]:
 
 def _homographies(part: Part, rows: Tensor) -> Tensor:
     """Return the homographies (n, 3, 3) from pixels to new pixels, as many as `rows`; NaN for moves that are none."""
-    moves = part.moves
-    if isinstance(moves, AffineWarp):
-        last = moves.matrix.new_tensor([0.0, 0.0, 1.0]).expand(*moves.matrix.shape[:-2], 1, 3)
-        return torch.cat((moves.matrix, last), -2).expand_as(rows)
+    motion = part.motion
+    if isinstance(motion, AffineWarp):
+        last = motion.matrix.new_tensor([0.0, 0.0, 1.0]).expand(*motion.matrix.shape[:-2], 1, 3)
+        return torch.cat((motion.matrix, last), -2).expand_as(rows)
     before, after, turn = part.camera, part.target, part.rotation
-    plain = moves is not None and moves.moves_by_cameras  # others move by depth or by row
+    plain = motion is not None and motion.moves_by_cameras  # others move by depth or by row
     if not plain or kind(before)[:2] != kind(after)[:2] or not (turn is None or isinstance(after, Pinhole)):
         return torch.full_like(rows, torch.nan)
     turned = torch.linalg.inv_ex(precise(before.K))[0]
