@@ -46,7 +46,7 @@ class FlipOptions(SampleOptions, total=False):
 
 
 class EditOptions(FlipOptions, total=False):
-    """Options of edits and of `RandomShutter`; see `Augmentation`."""
+    """The options that all augmentations have in common; see `Augmentation`."""
 
     p: float
 
@@ -168,12 +168,18 @@ class Augmentation(SampleTransform):
             for name, value in numbers.items()
         }
 
-    # What kinds of camtorch state otherwise, or override, besides `new_camera`; methods in the order of a call:
+    # What kinds of camtorch state otherwise, or override, besides `new_camera` and `extra_repr`; methods in the order
+    # of a call. `Compose` states attributes as properties, of all in it.
     #
-    # crops, place             BoxCrop; Compose, of all in it
-    # drawn_on_host            edits, lenses and mounts; Compose, if all in it are
+    # needs_camera             Edit; Compose
+    # makes_pinholes           lenses and mounts; Compose
+    # mirroring, ranges        Compose; flips and others set them when they are made
+    # crops, place             Compose; BoxCrop sets them when it is made
+    # drawn_on_host            edits, lenses and mounts; Compose
     # beside_the_camera        lenses and mounts: colours and light
     # keeps_lens               RandomShutter
+    # other_words              lenses and mounts
+    # _warp_options            Edit, whose warps choose what to antialias
     # _draw_numbers            Compose, of all in it
     # _with_labels             RandomMount, for the depths of a shift; here boxes, for `crops`
     # _checked_draw            RandomMount, of a draw that was given

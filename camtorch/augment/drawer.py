@@ -57,7 +57,7 @@ _REAL_LENS = KannalaBrandt([1.0, 1.0, 0.0, 0.0]).detach()  # of the model of rea
 
 
 class LensOptions(EditOptions, total=False):
-    """Options that `RandomMount` and `RandomLens` have in common; see `RandomCamera`."""
+    """Options that `RandomMount`, `RandomLens` and `RandomCamera` have in common; see `RandomCamera`."""
 
     min_filled: float | None
     chromatic: RangeLike | None

@@ -1,9 +1,11 @@
 """What is added in one place has its entries in the others: a test for each kind of list says what lacks what."""
 
+import inspect
 import re
 from pathlib import Path
 
 import pytest
+import torch
 from cameras import RANGES, STATED
 from rigs import MANIFEST, load
 
@@ -75,6 +77,15 @@ def test_every_class_is_in_the_laws(base, file):
     names = {kind.__name__ for kind in classes(getattr(ct.augment, base))} - {"Edit", "CameraDrawer"}
     assert len(names) > 5
     assert sorted(name for name in names if not re.search(rf"A\.{name}\b", text)) == [], f"{file} lacks them"
+
+
+def test_every_override_of_an_augmentation_is_in_its_table():
+    base = ct.augment.Augmentation
+    own = base.__mro__[: base.__mro__.index(torch.nn.Module)]
+    inherited = {name for kind in own for name in (*vars(kind), *kind.__annotations__)}
+    stated = {name for kind in classes(base) for name in vars(kind) if name in inherited and name[:2] != "__"}
+    lines = re.findall(r"^    # (\w+(?:, \w+)*)  +\S", Path(inspect.getfile(base)).read_text(), re.M)
+    assert sorted(", ".join(lines).split(", ")) == sorted(stated - {"new_camera", "extra_repr"})
 
 
 def test_every_kind_of_field_is_on_its_page():
