@@ -17,7 +17,7 @@ from camtorch.poses.rotations import is_right, turn
 from camtorch.projection.evaluation import camera_rows
 from camtorch.projection.native_cameras import Native
 from camtorch.values.module import remade
-from camtorch.warp.affine import AffineWarp, UncheckedWarp, after, made_like
+from camtorch.warp.affine import AffineWarp, HalvingWarp, after, made_like
 from camtorch.warp.options import Options
 from camtorch.warp.panorama import seam_of
 from camtorch.warp.warp import Warp
@@ -74,7 +74,7 @@ class LazyWarp:
 
     def warp(self, source: Camera) -> Warp:
         if self._warp is None:
-            self._warp = UncheckedWarp(source, self.target, self.rotation, **self.options)
+            self._warp = HalvingWarp(source, self.target, self.rotation, **self.options)
         return self._warp
 
     def starting_at(self, native: Native | None, rotation: Tensor | None) -> LazyWarp:
@@ -167,7 +167,7 @@ class Part:
             natives = first.natives if first.is_drawn else None
             native = _single(self.camera) if natives is None else natives[0]
             return replace(second, camera=self.camera, motion=last.starting_at(native, rotation))
-        moved = second.with_warps(lambda warp: UncheckedWarp(self.camera, warp.target, rotation))
+        moved = second.with_warps(lambda warp: HalvingWarp(self.camera, warp.target, rotation))
         return replace(moved, camera=self.camera)
 
     def _edited(self, edit: AffineWarp, rotation: Tensor | None) -> Part:
@@ -177,7 +177,7 @@ class Part:
             matrix = after(edit.map, self.motion.map)
             return replace(self, motion=AffineWarp(self.camera, edited(self.camera, matrix, size), matrix, rotation))
         light = None if self.light is None else edit(self.light, padding_mode="border")
-        moved = self.with_warps(lambda warp: UncheckedWarp(self.camera, edited(warp.target, edit.map, size), rotation))
+        moved = self.with_warps(lambda warp: HalvingWarp(self.camera, edited(warp.target, edit.map, size), rotation))
         return replace(moved, light=light)
 
 

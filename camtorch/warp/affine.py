@@ -1,4 +1,7 @@
-"""Warps of edited images: mirrored images, and images whose pixels move by crops, scales, flips and quarter turns."""
+"""Warps that choose how each image is made: halved before it is sampled, resized, or copied pixel by pixel.
+
+A `HalvingWarp` halves images that shrink. An `AffineWarp` is one whose pixels move by crops, scales, flips and turns.
+"""
 
 import math
 from collections.abc import Sequence
@@ -46,10 +49,10 @@ class ImageEdit(NamedTuple):
     flips: tuple[int, ...] = ()  # dims to flip
 
 
-class UncheckedWarp(Warp):
-    """A `Warp` whose rotation may be a mirror, and is not checked, and which may antialias by itself.
+class HalvingWarp(Warp):
+    """A `Warp` that, by antialias=None, halves images before it samples them if they shrink by more than 1.5.
 
-    antialias=None halves images that shrink by more than 1.5.
+    Its rotation is not checked, and may be a mirror.
     """
 
     may_mirror = True
@@ -138,7 +141,7 @@ class UncheckedWarp(Warp):
         return type(self)(source, target, rotation=rotation, **{**self.own_parts(), **options})
 
 
-class AffineWarp(UncheckedWarp):
+class AffineWarp(HalvingWarp):
     """A `Warp` that edits the image of `source`: all its pixels move by an affine map, also those without a ray.
 
     Shifts by whole pixels, flips and quarter turns copy pixels bit by bit. `matrix`, (2, 3) or (B, 2, 3) float64 and
@@ -229,7 +232,7 @@ class AffineWarp(UncheckedWarp):
 
 def made_like(warp: Warp, source: Camera, target: Camera, rotation: Tensor | None, options: Options) -> Warp:
     """Return a warp like another one between other cameras, of which neither cameras nor rotation are checked."""
-    make = UncheckedWarp if warp.moves_by_cameras else warp.between
+    make = HalvingWarp if warp.moves_by_cameras else warp.between
     return make(source, target, rotation, **options)
 
 
@@ -325,7 +328,7 @@ def _edited(
     *texts, matrix, is_last = options
     antialias, _, sampler = compiled.read(*texts)
     how: Any = {**sampler._asdict(), "antialias": antialias, "tolerance": tolerance}
-    warp: Warp = UncheckedWarp(source, target, rotation, **how)
+    warp: Warp = HalvingWarp(source, target, rotation, **how)
     if matrix is not None:
         warp = AffineWarp(source, target, matrix, rotation, **how)
     return (compiled.laid(warp(images), is_last),)

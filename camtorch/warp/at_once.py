@@ -102,7 +102,7 @@ def _coarse(size: tuple[int, int], dtype: torch.dtype) -> tuple[Tensor, tuple[in
 
 
 def _surely_keeps_size(back: NativeMove, sizes: Sizes) -> bool:
-    """Whether no image shrinks so far that a `UncheckedWarp` would halve it; back: from the target to the source."""
+    """Whether no image shrinks so far that a `HalvingWarp` would halve it; back: from the target to the source."""
     nodes, shape, step = _coarse(sizes[1], back.dtype)
     places = back.rows(nodes, structs.POSITIONS)[0].numpy().reshape(-1, *shape, 2)
     seen: np.ndarray[Any, Any] = np.all(abs(places) <= 1, axis=-1)

@@ -29,7 +29,7 @@ class Options(TypedDict):
     mode: Mode
     padding_mode: PaddingMode
     fill: tuple[float, ...]
-    antialias: bool | None  # None: an `UncheckedWarp` chooses for each image, as other warps do not
+    antialias: bool | None  # None: a `HalvingWarp` chooses for each image, as other warps do not
     tolerance: float | None
 
 

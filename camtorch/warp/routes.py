@@ -1,6 +1,6 @@
 """What every warp holds, and how it finds the positions at which its images are sampled.
 
-Which way a warp goes is decided in four places, after `ready` has asked for a kept call, and an `UncheckedWarp` whether
+Which way a warp goes is decided in four places, after `ready` has asked for a kept call, and a `HalvingWarp` whether
 images are copied, resized or halved:
 
 1. `RoutedWarp.route`: kept positions, those of a graph, strips, or an operator of a compiled graph.

@@ -24,7 +24,7 @@ from camtorch.values.arguments import (
     one_of,
 )
 from camtorch.values.module import GeometryModule
-from camtorch.warp.affine import UncheckedWarp
+from camtorch.warp.affine import HalvingWarp
 from camtorch.warp.grid import CameraPair
 from camtorch.warp.options import TolerantOptions
 from camtorch.warp.warp import Warp
@@ -149,7 +149,7 @@ def _check_exposure(exposure: Tensor | None) -> None:
         raise ValueError(f"RollingShutter: the state's exposure must be 0; got {exposure.tolist()}. {LEFT}")
 
 
-class ShutterWarp(UncheckedWarp):
+class ShutterWarp(HalvingWarp):
     """A `Warp` between cameras with rolling shutters: it undoes the source's shutter and applies the target's.
 
     Cameras and rotation are those of the middle of the readout. Images, points and boxes move by the row that sees

@@ -7,7 +7,7 @@ import torch
 
 import camtorch as ct
 from camtorch.poses.rotations import mount_rotation
-from camtorch.warp.affine import UncheckedWarp
+from camtorch.warp.affine import HalvingWarp
 
 WIDE, TALL = 256, 128
 
@@ -107,7 +107,7 @@ def test_images_that_are_halved_first_are_so_across_the_seam():
     camera, rotation = whole("equirectangular", torch.float32), mount_rotation(*torch.tensor([100.0, 50, 10]))
     target = camera.resize(20, 40)
     # as `augment.Compose` makes it of a mount and a smaller size
-    warp = UncheckedWarp(camera, target, rotation, antialias=None)
+    warp = HalvingWarp(camera, target, rotation, antialias=None)
     assert warp(image_of(camera)).std() > 0.05
     assert off(warp(image_of(camera)), target, rotation, 1.0) < 0.01
 

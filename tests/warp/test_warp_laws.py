@@ -9,7 +9,7 @@ import torch
 
 import camtorch as ct
 from camtorch.poses.rotations import rotation_matrix
-from camtorch.warp.affine import AffineWarp, UncheckedWarp
+from camtorch.warp.affine import AffineWarp, HalvingWarp
 from camtorch.warp.shifted import ShiftedWarp
 
 SIZE, SMALL = (24, 32), (10, 14)
@@ -183,7 +183,7 @@ def test_it_is_copied_and_mapped(kind):
 EDIT = torch.tensor([[[0.5, 0, 1], [0, 0.6, 2]], [[0.4, 0, 3], [0, 0.5, 1]]]).double()
 DEPTHS = torch.ones(2, 1, *SIZE).double()
 BATCHED = {
-    "turned": lambda p: turned(UncheckedWarp, p, antialias=None),
+    "turned": lambda p: turned(HalvingWarp, p, antialias=None),
     "edited": lambda p: AffineWarp(source(p), target(p), EDIT.clone().requires_grad_(), None),
     "shifted": lambda p: turned(partial(ShiftedWarp, depth=DEPTHS, kind="z", shift=p["shift"]), p),
 }
