@@ -138,7 +138,7 @@ enum { POSITIONS, PIXELS, ON_IMAGE, BOXES };
 enum { EDGE_POINTS = 64 }; /* along a side of a box; warp/boxes.py */
 /* What is left to do: pixels wait for the extent of `from`, points for the limits of `to`; most cells of a lattice want
    exact positions; or some box takes more than its outline, some pose has no rotation */
-enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4, LEFT_LABELS = 4 };
+enum { LEFT_FROM = 1, LEFT_TO = 2, LEFT_MOST = 4, LEFT_LABELS = 8 };
 #define OUTSIDE -9.0f /* a position that no image reaches, not even with its interpolation margin */
 #define FAR 100.0f    /* positions beyond are clamped to it: grid_sample casts them to integers */
 
@@ -176,7 +176,7 @@ typedef struct {
 } Lattices;
 
 enum { SQUARES = STEP * STEP }; /* positions in a cell */
-enum { LEFT_BITS = 3 };
+enum { LEFT_BITS = 4 }; /* flags of pixels and vectors stand so much higher than those of the lattice */
 
 /* What turns: vectors, NaN where one is not finite, of which the first three of a POSE are the columns of a rotation; or
    vectors of rotations, of which a turn by nothing leaves the bits */

@@ -84,7 +84,7 @@ class Call:
             self._is_copied = not together and result.stride(3) != 1
             result = torch.empty(result.shape, dtype=result.dtype, device="cpu") if self._is_copied else result
             images = _copied(images, self._layout)
-        self._tiles = 0 if 0 in result.shape else tiles_of(result)
+        self._tiles = 0 if 0 in result.shape else tiles_of(size) * result.shape[0]
         if not self._tiles:
             return
         job = self._job = structs.Job()
@@ -141,10 +141,10 @@ def _tile_rows(width: int) -> int:
     return max(_TILE_PIXELS // width // 8, 1) * 8
 
 
-def tiles_of(result: Tensor) -> int:
-    """Return the number of threads that samples may be split among."""
-    count, _, height, width = result.shape
-    return -(-height // _tile_rows(width)) * count
+def tiles_of(size: tuple[int, int]) -> int:
+    """Return the number of threads that the samples of an image (height, width) may be split among."""
+    height, width = size
+    return -(-height // _tile_rows(width))
 
 
 def is_quick(images: Tensor, result: Tensor, mode: Mode) -> bool:

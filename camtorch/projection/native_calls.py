@@ -266,9 +266,15 @@ def run_and_follow(
             flags = functools.reduce(operator.or_, left)
         if not flags & (structs.LEFT_FROM | structs.LEFT_TO):
             return flags
-        for flag, native in ((structs.LEFT_FROM, start), (structs.LEFT_TO, end)):
-            if flags & flag:
-                native.follow()
+        follow(flags, start, end)
+
+
+def follow(flags: int, start: Native, end: Native) -> None:
+    """Compute the limits of azimuths that a call lacked."""
+    if flags & structs.LEFT_FROM:
+        start.follow()
+    if flags & structs.LEFT_TO:
+        end.follow()
 
 
 class _PerThread(threading.local):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ from camtorch.evaluate.kept import Kept
 from camtorch.native import memory, structs
 from camtorch.native.library import loaded
 from camtorch.native.sampler import describe, is_quick, maker, takes, tiles_of
-from camtorch.projection.native_calls import Lattices, NativeMove, run_and_follow
+from camtorch.projection.native_calls import Lattices, NativeMove, follow, run_and_follow
 from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 from camtorch.warp.lattice import FEWEST_CELLS, MOST_KEPT_NODES, coarse, probes
@@ -35,7 +35,6 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]  # (height, width) of the source
 _FORMS = {"pose": structs.POSE, "rotation vectors": structs.ROTATION_VECTORS}  # others are rays
 _TILES_FOR_ONE_THREAD = 2  # an image of no more is made by one
 _SAMPLES_PER_THREAD = 4  # with as many, threads that idle at the end matter little
-_FLAGS_OF_PIXELS = 1 << structs.LEFT_BITS  # flags of pixels stand above those of the lattice
 
 
 def call_for(
@@ -159,53 +158,51 @@ class SampleCall:
     ):
         """Take the arguments of `call_for`."""
         self._sizes, self._dtype, self._batched = sizes, dtype, batched
-        self._count = count = len(values[0]) if batched else 1
-        # which values are images, pixels and boxes, and rays and the like; C has an array for each
-        images = [i for i, how in enumerate(hows) if isinstance(how, Sampler)]
-        moved = [i for i, how in enumerate(hows) if how in ("pixels", "boxes")]
-        turned = [i for i in range(len(hows)) if i not in images and i not in moved]
-        self._jobs = (structs.Job * len(images))()
-        moves = (structs.Move * len(moved))()
-        turns = (structs.Turned * len(turned))()
-        call = self._call = structs.Together(job_count=len(images), move_count=len(moved), turned_count=len(turned))
-        call.jobs, call.moves, call.turned = call.keep(self._jobs), call.keep(moves), call.keep(turns)
-        # the lattice by which all images are sampled
-        samplers: list[Any] = [hows[i] for i in images]
-        padding = serving_all("zeros", *(how.padding_mode for how in samplers))
-        with torch.inference_mode(False):
-            nodes, tolerance = probes(0, sizes[1], dtype), float(options["tolerance"] or 0)
-            self._lattices = Lattices(nodes, sizes[1], sizes[0], tolerance, padding, count)
-        call.lattices = self._lattices.struct
-        self._back = call.lattices.move  # from the target to the source, which images are sampled by
-        if count > 1:  # C samples images as soon as their lattice is made
-            call.lattices.jobs, call.lattices.job_count = call.jobs, call.job_count
-        else:
-            self._back.next = None  # one thread makes the lattice, and needs no counter of those made
-        self._most_tiles = 1  # of the images, each of which threads share
-        readers: dict[int, Reader] = {}
-        for i, job, how in zip(images, self._jobs, samplers, strict=True):
-            readers[i] = self._reader_of_images(job, values[i], how)
-        for i, move in zip(moved, moves, strict=True):
-            readers[i] = self._reader_of_pixels(move, values[i], 2 if hows[i] == "pixels" else 4)
-        for i, turn in zip(turned, turns, strict=True):
-            readers[i] = self._reader_of_vectors(turn, values[i], hows[i])
+        self._count = len(values[0]) if batched else 1
+        self._call = structs.Together()
+        samplers = {i: how for i, how in enumerate(hows) if isinstance(how, Sampler)}
+        pixels = {i: how for i, how in enumerate(hows) if how in ("pixels", "boxes")}
+        vectors = {i: how for i, how in enumerate(hows) if i not in samplers and i not in pixels}
+        self._lattices = self._lattices_of(samplers.values(), float(options["tolerance"] or 0))
+        self._back = self._call.lattices.move  # from the target to the source, which images are sampled by
+        readers = self._read_images(samplers, values) | self._read_pixels(pixels, values)
+        readers |= self._read_vectors(vectors, values)
         self._readers = [readers[i] for i in range(len(hows))]
-        self._copied = [i for i in moved if values[i].dtype != dtype or not values[i].is_contiguous()]
+        self._copied = [i for i in pixels if values[i].dtype != dtype or not values[i].is_contiguous()]
         self._may_be_refused = [i for i, how in enumerate(hows) if how in ("boxes", "pose", "rotation vectors")]
         # whether each run asks if images shrink: these are halved elsewhere
         self._may_halve = options["antialias"] is None and any(map(_is_averaged, values, hows))
-        self._images_of_call = len(images) if count == 1 else 0  # those of a batch are made with their lattices
-        self._is_small = self._most_tiles <= _TILES_FOR_ONE_THREAD or not self._images_of_call  # one thread makes all
+        self._images_of_call = len(samplers) if self._count == 1 else 0  # those of a batch are made with their lattices
+        self._tiles = tiles_of(sizes[1])  # of an image, which threads share
+        self._is_small = self._tiles <= _TILES_FOR_ONE_THREAD or not self._images_of_call  # one thread makes all
 
-    def _reader_of_images(self, job: structs.Job, like: Tensor, how: Sampler) -> Reader:
-        """Write into a job of C what all runs share; return what writes the rest in each run."""
+    def _lattices_of(self, samplers: Iterable[Sampler], tolerance: float) -> Lattices:
+        """Return the lattices by which all images are sampled, of which C has the struct."""
+        padding = serving_all("zeros", *(how.padding_mode for how in samplers))
+        with torch.inference_mode(False):
+            nodes = probes(0, self._sizes[1], self._dtype)
+            made = Lattices(nodes, self._sizes[1], self._sizes[0], tolerance, padding, self._count)
+        self._call.lattices = made.struct
+        return made
+
+    def _read_images(self, samplers: Mapping[int, Sampler], values: Sequence[Tensor]) -> dict[int, Reader]:
+        """Give C the images and masks, and return their readers, by their places among the values."""
+        call = self._call
+        jobs = self._jobs = (structs.Job * len(samplers))()
+        call.jobs, call.job_count = call.keep(jobs), len(jobs)
+        if self._count > 1:  # C samples images as soon as their lattice is made
+            call.lattices.jobs, call.lattices.job_count = call.jobs, call.job_count
+        else:
+            self._back.next = None  # one thread makes the lattice, and needs no counter of those made
+        return {i: self._image_reader(job, values[i], samplers[i]) for i, job in zip(samplers, jobs, strict=True)}
+
+    def _image_reader(self, job: structs.Job, like: Tensor, how: Sampler) -> Reader:
+        """Write into a job what all runs share; return what writes the rest in each run."""
         image = _as_images(like, self._batched)
         make_images = maker(image, self._count, self._sizes[1])
-        result = make_images()
         fill = how.fill * image.shape[1] if len(how.fill) == 1 else how.fill
-        describe(job, image, result, how.mode, how.padding_mode, fill)
+        describe(job, image, make_images(), how.mode, how.padding_mode, fill)
         self._lattices.lay(job)  # has the job sample by the positions of the lattice
-        self._most_tiles = max(self._most_tiles, tiles_of(result[:1]))
         make = _image_maker(like, self._batched, make_images)
 
         def read(value: Tensor) -> MovedField:
@@ -215,14 +212,22 @@ class SampleCall:
 
         return read
 
-    def _reader_of_pixels(self, move: structs.Move, like: Tensor, each: int) -> Reader:
+    def _read_pixels(self, hows: Mapping[int, Any], values: Sequence[Tensor]) -> dict[int, Reader]:
+        """Give C the pixels and boxes, and return their readers, by their places among the values."""
+        call = self._call
+        moves = (structs.Move * len(hows))()
+        call.moves, call.move_count = call.keep(moves), len(moves)
+        return {i: self._pixel_reader(move, values[i], hows[i]) for i, move in zip(hows, moves, strict=True)}
+
+    def _pixel_reader(self, move: structs.Move, like: Tensor, how: Any) -> Reader:
+        """Write into a move what all runs share; return what writes the rest in each run."""
         dtype, back = self._dtype, self._back
         turn_strides: Any = back.turn_strides
+        each, move.form = (2, structs.ON_IMAGE) if how == "pixels" else (4, structs.BOXES)
         many = like.numel() // (each * self._count) if self._count else 0
         move.turn_strides[:] = 0, 3, 1
         move.cameras = self._count
         move.height, move.width = self._sizes[1]
-        move.form = structs.ON_IMAGE if each == 2 else structs.BOXES
         move.count, move.tile = many, max(many, 1)
         move.row_strides[:] = move.result_strides[:] = each * many, each, 1
 
@@ -237,7 +242,15 @@ class SampleCall:
 
         return read
 
-    def _reader_of_vectors(self, turned: structs.Turned, like: Tensor, how: Any) -> Reader:
+    def _read_vectors(self, hows: Mapping[int, Any], values: Sequence[Tensor]) -> dict[int, Reader]:
+        """Give C the rays and what turns like them, and return their readers, by their places among the values."""
+        call = self._call
+        turns = (structs.Turned * len(hows))()
+        call.turned, call.turned_count = call.keep(turns), len(turns)
+        return {i: self._vector_reader(turn, values[i], hows[i]) for i, turn in zip(hows, turns, strict=True)}
+
+    def _vector_reader(self, turned: structs.Turned, like: Tensor, how: Any) -> Reader:
+        """Write into what turns what all runs share; return what writes the rest in each run."""
         back, width = self._back, like.shape[-1]
         is_matrix = how in ("columns", "pose")
         turned.strides[:], turned.count = ((1, width), width) if is_matrix else ((3, 1), like.numel() // 3)
@@ -291,24 +304,18 @@ class SampleCall:
         while flags := native.camtorch_together(call):
             if flags & structs.LEFT_MOST:
                 return None
-            if self._follow(flags, source, target) == structs.LEFT_LABELS:  # nothing else is missing
+            of_labels = flags >> structs.LEFT_BITS  # if C came to the labels, all images are made
+            if not of_labels:
+                follow(flags, target, source)
+                continue
+            call.job_count = 0
+            follow(of_labels, source, target)
+            if of_labels == structs.LEFT_LABELS:  # nothing else is missing
                 for i in self._may_be_refused:
                     results[i] = None
                 break
         if not one_thread:
             for job in self._jobs:  # threads share each image by its tiles
                 job.next = 0
-                spread(functools.partial(native.camtorch_sample, job), min(threads, self._most_tiles))
+                spread(functools.partial(native.camtorch_sample, job), min(threads, self._tiles))
         return results
-
-    def _follow(self, flags: int, source: Native, target: Native) -> int:
-        """Compute limits that the call lacked: of cameras for the lattice, or for pixels, whose flags it returns."""
-        of_pixels = flags // _FLAGS_OF_PIXELS
-        left, start, end = (of_pixels, source, target) if of_pixels else (flags, target, source)
-        if left & structs.LEFT_FROM:
-            start.follow()
-        if left & structs.LEFT_TO:
-            end.follow()
-        if of_pixels:
-            self._call.job_count = 0  # the images are made
-        return of_pixels
