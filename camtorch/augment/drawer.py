@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -27,7 +26,7 @@ from camtorch.models import KannalaBrandt, Pinhole
 from camtorch.optics.radial_inverse import precise
 from camtorch.poses.rotations import mount_elements
 from camtorch.rays.lattices import field_of_view
-from camtorch.values.arguments import LEFT, as_image_size, broadcast_shapes, check_degrees
+from camtorch.values.arguments import LEFT, as_image_size, broadcast_shapes, check_degrees, present
 from camtorch.values.module import remade
 from camtorch.warp.vignetting import falloff, vignetting
 from camtorch.warp.warp import Warp
@@ -181,9 +180,12 @@ class CameraDrawer(Augmentation):
         None if a camera learns, or native code lacks a range or a model.
         """
         tensors: tuple[Tensor, ...] = (source.intrinsics, source.distortion)
-        like = None if self._modules.get("like") is None else self._like_for(source)  # most mounts have none
+        like: Camera | None = self._modules.get("like")  # type: ignore[assignment]  # `self.like` in less time
         if like is not None:
-            tensors += like.tensors
+            numbers = like.tensors
+            if not numbers[0].is_cpu:
+                numbers = present(self._like_for(source), "like").tensors
+            tensors += numbers
         if not hold_numbers(tensors):
             return None
         if self._is_real:  # each draw has a lens of its own
@@ -191,10 +193,7 @@ class CameraDrawer(Augmentation):
         # all else that new cameras depend on
         sizes = source.image_size, None if like is None else like.image_size
         key = "start", type(source), *sizes, self._calls.revision, self.ranges.get("fov"), self.min_filled, *values
-        known = self._memo.entry(tensors, key)
-        if known is None:
-            return self._memo(tensors, key, partial(self._new_start, source, values))
-        start: Start | None = known.result
+        start: Start | None = self._memo.get(tensors, key, self._new_start, source, values)
         return start
 
     def _new_start(self, source: Camera, values: Mapping[str, Any]) -> Start | None:

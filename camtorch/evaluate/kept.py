@@ -39,18 +39,30 @@ class Kept:
     def __call__(self, inputs: Sequence[Tensor], key: tuple[Any, ...], compute: Callable[[], T]) -> T:
         """Return `compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `key`."""
         may_read = not inputs or is_eager(*inputs) or all(is_concrete(t) and not has_tangent(t) for t in inputs)
-        if not may_read:
-            return compute()
-        entry = self.entry(inputs, key)
-        if entry is not None:
-            found: T = entry.result
-            self.result = found
-            return found
+        result: T = self.get(inputs, key, compute) if may_read else compute()
+        return result
+
+    def get(
+        self, inputs: Sequence[Tensor], key: tuple[Any, ...], compute: Callable[..., Any] | None = None, *arguments: Any
+    ) -> Any:
+        """Return what is kept for inputs whose values may be read, else `compute(*arguments)`, which is kept then.
+
+        Without `compute` None if nothing is kept.
+        """
+        known = self._kept
+        for i, entry in enumerate(known):
+            if key == entry.key and all(map(same, inputs, entry.notes)):
+                if i:  # a new list, as another thread may be reading this one
+                    self._kept = [entry, *known[:i], *known[i + 1 :]]
+                self.result = result = entry.result
+                return result
+        if compute is None:
+            return None
         if in_transform():  # a transform's tensors die with it
-            return compute()
+            return compute(*arguments)
         with torch.inference_mode(False), torch.no_grad():  # a graph cannot use tensors of inference mode
             notes = [note(t) for t in inputs]
-            result = compute()
+            result = compute(*arguments)
         self._kept, self.result = [Entry(key, notes, result), *self._kept[: self.capacity - 1]], result
         return result
 
