@@ -26,5 +26,7 @@ class FrontEnd(KeepsCamera):
 
 def check_front_end(owner: str, augmentation: object, *kinds: type[SampleTransform]) -> None:
     """Raise a TypeError unless `augmentation` is of one of the `kinds`; without any, an `Augmentation`."""
-    if not isinstance(augmentation, kinds or Augmentation):
-        raise TypeError(f"{owner}: augmentation must be an Augmentation; got {type(augmentation).__name__}")
+    kinds = kinds or (Augmentation,)
+    if not isinstance(augmentation, kinds):
+        named = " or a ".join(kind.__name__ for kind in kinds)
+        raise TypeError(f"{owner}: augmentation must be an {named}; got {type(augmentation).__name__}")

@@ -123,7 +123,7 @@ def test_errors_name_the_field_and_its_shape():
         (transform, "mask must be a numpy array .* got Tensor", {"mask": torch.from_numpy(mask)}),
         (transform, "keypoints must be a numpy array .* got list", {"keypoints": [[1, 2], [3]]}),
         (transform, r"transform\(image=...\); got ndarray", image),
-        (ct.augment.numpy.Transform, "got str", "RandomMount"),
+        (ct.augment.numpy.Transform, "must be an Augmentation or a FaceNormalizer; got str", "RandomMount"),
         *((own, last.format(n, n, "2, 0, 1"), {n: v}) for n in names for v in (image, one, [one, one])),
         *((own, last.format(n, n, "0, 3, 1, 2"), {n: one[None]}) for n in names),
     ):
