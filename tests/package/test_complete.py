@@ -15,6 +15,7 @@ from camtorch.cameras import operators
 from camtorch.maps import formats as maps
 from camtorch.values.stub import listed_names
 from camtorch.viewer.viewer import models
+from camtorch.warp.options import MODES
 
 ROOT = Path(__file__).parents[2]
 
@@ -98,6 +99,20 @@ def test_every_augmentation_is_one_of_kornia():
     kornia = pytest.importorskip("camtorch.augment.kornia")
     names = {kind.__name__ for kind in classes(ct.augment.Augmentation)} - {"Edit", "CameraDrawer", "RandomShutter"}
     assert sorted(name for name in names if not hasattr(kornia, name)) == []
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_every_library_that_is_given_a_mode_has_it(mode, tmp_path):
+    runtime, kornia = pytest.importorskip("onnxruntime"), pytest.importorskip("camtorch.augment.kornia")
+    camera, half = ct.Pinhole.from_fov(60, image_size=(8, 12)), {"mode": mode, "antialias": True}
+    images = torch.rand(1, 3, 8, 12, generator=torch.Generator().manual_seed(0))
+    resized = ct.augment.Resize((4, 6), **half)(image=images)["image"]  # by torch's `interpolate`
+    assert torch.equal(kornia.Resize(camera, (4, 6), **half)(images), resized)
+    warp = ct.Warp(camera, ct.Pinhole.from_fov(50, image_size=(7, 9)), mode=mode)
+    ct.save_map(warp, tmp_path / "warp.onnx")
+    torch.testing.assert_close(ct.load_map(tmp_path / "warp.onnx")(images, mode), warp(images))
+    session = runtime.InferenceSession(tmp_path / "warp.onnx", providers=["CPUExecutionProvider"])
+    torch.testing.assert_close(torch.from_numpy(session.run(None, {"images": images.numpy()})[0]), warp(images))
 
 
 def test_operators_keep_the_names_that_saved_programs_have():
