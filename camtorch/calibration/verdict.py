@@ -64,7 +64,7 @@ class Calibration:
     """How far the middle of the board lies off the plane of its edges, along x and y; zeros without bend=True."""
     image_size: tuple[int, int]
     views: tuple[int, ...]
-    """The indices of passed views that have poses: those with corners, unlike all earlier ones."""
+    """The indices of passed views that have poses: those with corners, `copies` among them."""
     copies: tuple[int, ...]
     """The indices of passed views that repeat another one, which widens the uncertainties as if they were missing."""
     observations: Observations = field(repr=False)
