@@ -122,11 +122,13 @@ class Change:
 
     def rotation_for_sample(self, batched: bool) -> Tensor:
         """Return a copy of the rotations (count, 3, 3), or of the one (3, 3) of a change of one sample."""
-        motion = self.parts[0].motion
-        rotation = None if motion is None else motion.rotation
-        if batched or self.gate is not None or (rotation is not None and rotation.ndim > 2):
-            return (self.rotation if batched else self.rotation[0]).clone()
-        return _eye(self.parts[0].camera.intrinsics) if rotation is None else rotation.clone()
+        first = self.parts[0]
+        rotation = None if first.motion is None else first.motion.rotation
+        if self.gate is None and not batched:
+            return _eye(first.camera.intrinsics) if rotation is None else rotation.reshape(3, 3).clone()
+        if self.gate is None and first.rows is None and rotation is not None:
+            return rotation.expand(self.count, 3, 3).clone()
+        return (self.rotation if batched else self.rotation[0]).clone()
 
     several: Camera = _renamed("several", "camera_for_sample", batched=True)
     single: Camera = _renamed("single", "camera_for_sample", batched=False)

@@ -122,17 +122,17 @@ class SamplePlan:
         known = calls.entry((), settings)
         if known is None:
             new = functools.partial(self._new_call, values, part.camera, size, source.dtype, motion.options, labels)
-            kept: CallOfFields | None = calls((), settings, new)
+            of_fields: CallOfFields | None = calls((), settings, new)
         else:
-            kept = known.result
-        if kept is None:
+            of_fields = known.result
+        if of_fields is None:
             return {}
         # 4. The call moves its fields, or refuses the values
-        moved = kept.call(source, target, rotation, [*map(values.__getitem__, kept.names)])
+        moved = of_fields.call(source, target, rotation, [*map(values.__getitem__, of_fields.names)])
         if moved is None:
             return {}
-        results = dict(zip(kept.names, moved, strict=True))
-        for name in kept.narrowed:
+        results = dict(zip(of_fields.names, moved, strict=True))
+        for name in of_fields.narrowed:
             pair = results[name]
             if pair is not None:
                 results[name] = _in_range(pair[0], values[name].dtype), pair[1]
@@ -162,8 +162,8 @@ class SamplePlan:
                 hows[name] = how
         if not hows:
             return None
-        sizes, chosen = (camera.size_for("Warp"), size), [values[name] for name in hows]
-        call = call_for(sizes, dtype, options, chosen, [*hows.values()], self.batched)
+        sizes = camera.size_for("Warp"), size
+        call = call_for(sizes, dtype, options, [values[name] for name in hows], [*hows.values()], self.batched)
         if call is None:
             return None
         narrowed = [name for name, how in hows.items() if how in ("pixels", "boxes") and values[name].dtype != dtype]
@@ -189,7 +189,8 @@ class SamplePlan:
     def _pixels_at_once(self, part: Part, values: Mapping[str, Any]) -> dict[str, MovedField]:
         """Move all pixels and boxes by one evaluation of the cameras: in torch each takes hundreds of operations."""
         warp, dtype = part.warp, part.camera.intrinsics.dtype
-        given, outlines = dict[str, Tensor](), list[Tensor]()
+        given: dict[str, Tensor] = {}
+        outlines: list[Tensor] = []
         for name, kind in self.fields.items():
             value = values[name]
             if isinstance(value, list) or value.dtype != dtype or value.ndim - self.batched > KINDS[kind].most_dims:
@@ -201,8 +202,9 @@ class SamplePlan:
         if len(given) < 2 or not warp.moves_by_cameras:  # others move points by more than their cameras
             return {}
         moved, mapped = warp.move(torch.cat([outline.flatten(1, -2) for outline in outlines], 1))
-        counts, results = [outline.shape[1:-1].numel() for outline in outlines], dict[str, MovedField]()
+        counts = [outline.shape[1:-1].numel() for outline in outlines]
         pairs = zip(moved.split(counts, 1), mapped.split(counts, 1), strict=True)
+        results: dict[str, MovedField] = {}
         for (name, rows), outline, pair in zip(given.items(), outlines, pairs, strict=True):
             places, seen = pair[0].reshape(outline.shape), pair[1].reshape(outline.shape[:-1])
             if outline is rows:
