@@ -168,8 +168,8 @@ class RoutedWarp(GeometryModule):
         host = self._host
         if host is None or is_unknown(self.target.intrinsics):
             return None
-        entry = host.entry(self.tensors, ())
-        return None if entry is None else entry.result
+        warp: Self | None = host.get(self.tensors, ())
+        return warp
 
     def follow_host(self, host: RoutedWarp) -> Self:
         """Have a warp like this one, on the CPU, find the positions while the cameras stay; return this warp."""
@@ -282,7 +282,7 @@ class RoutedWarp(GeometryModule):
         if call is None or known.is_pinned:
             return call
         learns = images.dtype.is_floating_point and keeps_graph(*tensors)
-        return None if learns or self._kept.entry(tensors, self.form) is None else call
+        return None if learns or self._kept.get(tensors, self.form) is None else call
 
     def _form_of(self, images: Tensor, mode: str, padding: str) -> tuple[object, ...]:
         return images.shape, images.stride(), images.dtype, mode, padding, self.fill
