@@ -112,12 +112,12 @@ def pinhole_of_matrix(name: str, matrix: Tensor | list[Tensor], size: tuple[int,
                 f"{owner}: {name} must be {SHAPE}; got shape {tuple(row.shape)}. {matrix_hint(row, name, False)}"
             )
         check_matrix(row, name, owner)
-    numbers = torch.stack([numbers_of(row) for row in rows]) if isinstance(matrix, list) else numbers_of(matrix)
-    off = off_centre(numbers, size)
+    intrinsics = torch.stack([numbers_of(row) for row in rows]) if isinstance(matrix, list) else numbers_of(matrix)
+    off = off_centre(intrinsics, size)
     if off and first_time(("matrix of another image", owner)):
         warn_of_order(off, size, owner)
         warn_of_size(off, size, owner)
-    return pinhole(numbers, size)
+    return pinhole(intrinsics, size)
 
 
 def check_agrees(name: str, matrix: Tensor | list[Tensor], camera: Camera, of: str, owner: str) -> None:

@@ -11,7 +11,7 @@ from camtorch.values.arguments import Numbers, as_values
 from camtorch.values.module import BatchedModule, remade
 
 
-def as_tensor(values: Numbers, name: str, owner: str, device: torch.device) -> Tensor:
+def as_stacked(values: Numbers, name: str, owner: str, device: torch.device) -> Tensor:
     """Return a tensor of numbers, which may be NaN, from a tensor, an array, or lists, also of tensors of one shape."""
     if isinstance(values, (list, tuple)) and values and all(getattr(v, "ndim", 0) for v in values):
         return torch.stack([as_values(v, f"{name}[{i}]", owner, device) for i, v in enumerate(values)])
@@ -20,7 +20,7 @@ def as_tensor(values: Numbers, name: str, owner: str, device: torch.device) -> T
 
 def as_vectors(values: Numbers, name: str, size: int, owner: str, device: torch.device) -> Tensor:
     """Return vectors (*B, N, size) from such values, or from OpenCV's (*B, N, 1, size)."""
-    vectors = as_tensor(values, name, owner, device)
+    vectors = as_stacked(values, name, owner, device)
     if vectors.ndim > 2 and vectors.shape[-2] == 1 and vectors.shape[-3] > 1:
         vectors = vectors.squeeze(-2)
     if vectors.ndim < 2 or vectors.shape[-1] != size:

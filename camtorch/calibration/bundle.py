@@ -361,7 +361,7 @@ class Bundle:
             return Equations(view, shared)
         width, total, parts = self.width, self.shared_width, []
         for c, errors in enumerate(by_camera):
-            block, at = self.rows_of(c, errors, state, rows)
+            block, at = self.linearised_rows(c, errors, state, rows)
             if total and len(self.observed) > 1:  # a triangle has fewer rows to spread over the columns of all cameras
                 block = torch.linalg.qr(block, mode="r").R
                 whole = block.new_zeros(*block.shape[:-1], width + total + 1)
@@ -389,7 +389,7 @@ class Bundle:
                 found.append(rows)
         return found
 
-    def rows_of(self, c: int, errors: Errors, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
+    def linearised_rows(self, c: int, errors: Errors, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
         """Return rows (B, V, 2 N, L + F + 1) of a camera, and the indices of its F columns among shared unknowns."""
         observed = self.observed_by(c, rows)
         turned, first, points = self.points(c, state, observed)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from camtorch.calibration.bundle import Adjusted, CameraObservations, Free, Poses, Prior, State, adjust
-from camtorch.calibration.model import Model, as_model
+from camtorch.calibration.model import Model, asked_model
 from camtorch.calibration.observations import Observations, Points, as_observations, repeats
 from camtorch.calibration.robust import Loss, as_loss
 from camtorch.calibration.start import Lens, as_seen, other_cameras, other_poses, poses_for, start_from_nothing
@@ -77,7 +77,7 @@ def calibrate(
     owner = "calibrate"
     seen = as_observations(object_points, image_points, image_size, owner)
     robust, bend = as_loss(loss, loss_scale, owner), as_flag(bend, "bend", owner)
-    search = Search(owner, as_model(model, count, start, fixed, owner), seen, middle_of([seen]), robust)
+    search = Search(owner, asked_model(model, count, start, fixed, owner), seen, middle_of([seen]), robust)
     (result,), _ = results([search], search.alone(bend), search.free(bend))
     if not result.converged:
         warn(f"{owner}: {result.failure} (rms {result.rms:.4g} px). Do not use the result; see its warnings")

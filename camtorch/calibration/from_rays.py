@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 import torch
 from torch import Tensor
 
-from camtorch.calibration.model import Model, as_model
+from camtorch.calibration.model import Model, asked_model
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import fixed_camera
 from camtorch.convert import fitting, views
@@ -64,7 +64,7 @@ def fit(
         Conversion(rays -> DoubleSphere: rms 0.237 px, max 1.34 px, up to 67.1 degrees, 100 % of the image)
     """
     owner = "fit"
-    asked = as_model(model, count, None, fixed, owner)
+    asked = asked_model(model, count, None, fixed, owner)
     start = asked.start
     size = as_image_size(image_size, owner) or (None if start is None else start.image_size)
     kept = _kept_values(asked, size, owner)

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.parametrize import type_before_parametrizations
 
-from camtorch.cameras.camera import Camera
-from camtorch.cameras.camera import as_model as as_kind
+from camtorch.cameras.camera import Camera, as_model
 from camtorch.cameras.freezing import INTRINSICS, frozen_names
 from camtorch.values.arguments import as_whole, no_camera
 
@@ -44,7 +43,7 @@ class Model:
         return found
 
 
-def as_model(
+def asked_model(
     model: type[Camera] | str | Camera,
     count: int | None,
     start: Camera | None,
@@ -56,7 +55,7 @@ def as_model(
         if start is not None:
             raise ValueError(f"{owner}: start must be left out if model is a camera; got {start!r}")
         start, model = model, type_before_parametrizations(model)
-    kind = as_kind(model, owner)
+    kind = as_model(model, owner)
     if start is not None:
         start = _as_start(start, kind, owner)
         own = start.distortion.shape[-1]

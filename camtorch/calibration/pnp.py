@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch.calibration.batches import as_double_rows, as_tensor, as_vectors, attached, learns, root_of
+from camtorch.calibration.batches import as_double_rows, as_stacked, as_vectors, attached, learns, root_of
 from camtorch.calibration.bundle import CameraObservations, Poses, adjust_poses
 from camtorch.calibration.native_calls import PoseSearch, Solved, solve_poses
 from camtorch.calibration.ransac import LEAST, consensus
@@ -158,7 +158,7 @@ class _Given(NamedTuple):
         points = as_vectors(object_points, "object_points", 3, owner, device)
         seen_at = as_vectors(pixels, "pixels", 2, owner, device)
         count = seen_at.shape[-2]
-        given = None if weights is None else as_tensor(weights, "weights", owner, device)
+        given = None if weights is None else as_stacked(weights, "weights", owner, device)
         shapes = f"object_points {tuple(points.shape)} and pixels {tuple(seen_at.shape)}"
         if points.shape[-2] != count or count < LEAST:
             hint = "Pad rows of fewer points with NaN pixels"

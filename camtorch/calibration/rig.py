@@ -10,7 +10,7 @@ from torch import Tensor
 
 from camtorch.calibration.bundle import Bundle, CameraObservations, Free, Poses, State, adjust
 from camtorch.calibration.calibrate import STEPS, Search, extrinsics_of, middle_of, results, rms_of
-from camtorch.calibration.model import as_model
+from camtorch.calibration.model import asked_model
 from camtorch.calibration.observations import Points, as_rig_observations
 from camtorch.calibration.robust import Loss, as_loss
 from camtorch.calibration.uncertainty import shared_factor
@@ -44,7 +44,7 @@ class RigCalibration:
     bend: tuple[float, float]
     """The bend of the board, as in `Calibration`."""
     views: tuple[int, ...]
-    """The indices of passed views that some camera saw, without copies of others."""
+    """The indices of passed views that some camera saw, also those that are `copies` in `cameras`."""
 
     @property
     def residuals(self) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def calibrate_rig(
     middle, searches = middle_of([*by_name.values()]), []
     for name, observations in by_name.items():
         of = f"{owner}: {name}"
-        asked = as_model(models[name], _own(count, name, None), _own(start, name, None), _own(fixed, name, ()), of)
+        asked = asked_model(models[name], _own(count, name, None), _own(start, name, None), _own(fixed, name, ()), of)
         searches.append(Search(of, asked, observations, middle, robust))
     observed = [search.observed for search in searches]
     learns = tuple(parameters for search in searches for parameters in search.free().parameters)

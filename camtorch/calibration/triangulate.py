@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch.calibration.batches import as_double_rows, as_tensor, attached, learns, root_of
+from camtorch.calibration.batches import as_double_rows, as_stacked, attached, learns, root_of
 from camtorch.calibration.bundle import CameraObservations, Free, Poses, State, adjust
 from camtorch.cameras.camera import Camera
 from camtorch.least_squares.equations import System
@@ -73,7 +73,7 @@ def triangulate(
         [0.5, 0.2, 2.0]
     """
     device = pixels.device if isinstance(pixels, Tensor) else torch.device("cpu")
-    seen_at = as_tensor(pixels, "pixels", "triangulate", device)
+    seen_at = as_stacked(pixels, "pixels", "triangulate", device)
     if seen_at.ndim < 2 or seen_at.shape[-1] != 2:
         raise ValueError(f"triangulate: pixels must be (C, *N, 2); got shape {tuple(seen_at.shape)}")
     count, *shape = seen_at.shape[:-1]

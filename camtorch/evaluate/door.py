@@ -193,7 +193,7 @@ def is_cheap_to_read(tensor: Tensor) -> bool:
     return tensor.is_cpu and is_concrete(tensor) and 0 not in tensor.shape
 
 
-class Way(NamedTuple):
+class WayOfCall(NamedTuple):
     """The way in which a call is evaluated."""
 
     is_native: bool  # native code evaluates the call, if it has the model
@@ -201,10 +201,10 @@ class Way(NamedTuple):
     is_known: bool  # the values of the parameters may be read, so that results made of them are kept
 
 
-_NATIVE, _LEARNING = Way(True, False, True), Way(True, True, True)
+_NATIVE, _LEARNING = WayOfCall(True, False, True), WayOfCall(True, True, True)
 
 
-def way_of(owner: str, values: Tensor, *parameters: Tensor) -> Way:
+def way_of(owner: str, values: Tensor, *parameters: Tensor) -> WayOfCall:
     """Return the way of a call with values and parameters; raise a RuntimeError if torch can record none."""
     # called once a call, so all in one place: each further function would take as long as its question
     is_plain = not (
@@ -226,7 +226,7 @@ def way_of(owner: str, values: Tensor, *parameters: Tensor) -> Way:
             )
         if in_memory(values) and not in_jit_trace() and torch._C._len_torch_dispatch_stack() == 0:
             return _LEARNING if learns and torch.is_grad_enabled() else _NATIVE
-    return Way(False, False, all(is_concrete(t) and not has_tangent(t) for t in parameters))
+    return WayOfCall(False, False, all(is_concrete(t) and not has_tangent(t) for t in parameters))
 
 
 def while_loop(condition: Callable[..., Any], body: Callable[..., Any], state: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from camtorch.calibration.model import as_model
+from camtorch.calibration.model import asked_model
 from camtorch.cameras.camera import Camera
 from camtorch.networks.limits import Limits
 from camtorch.networks.prior import prior_of
@@ -88,7 +88,7 @@ class CameraHead(GeometryModule):
         names = () if not isinstance(fixed, Collection) else (fixed,) if isinstance(fixed, str) else tuple(fixed)
         if any(isinstance(name, str) and name in ("fx", "fy", "all") for name in names):
             raise ValueError(f"{owner}: fixed must not name fx, fy or all; got {fixed!r}. Use fov=(90, 90)")
-        asked = as_model(model, count, None, fixed, owner)
+        asked = asked_model(model, count, None, fixed, owner)
         known = None if asked.start is None else asked.start.image_size
         size = as_image_size(image_size, owner) or known
         if size is None:

@@ -23,7 +23,10 @@ _SHARED_POINTS = 1 << 15  # with fewer, to wake threads would take longer
 
 
 def project(native: Native, points: Tensor, learns: bool = False) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    """Return pixels (2, C, N) of points (C, N, 3), whether they are valid (C, N), and what `project_vjp` needs."""
+    """Return pixels (2, C, N) of points (C, N, 3), whether they are valid (C, N), and what `project_vjp` needs.
+
+    That is the points, whether anything `learns` or not: a `Direction` passes this to both of its calls.
+    """
     pixels, valid = _evaluate(native, structs.PROJECT, points, 2, None)
     return pixels, valid, (points,)
 
