@@ -6,7 +6,6 @@ complement does, without the squares of normal equations.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -237,13 +236,11 @@ class Bundle:
             for camera, p, f in zip(self.cameras, state.parameters, free.parameters, strict=True)
         ]
         # for each camera, the places of its parameters among the shared unknowns, and their indices; those of its mount
-        places = itertools.count()
+        self.shared_width = 0  # the number of shared unknowns
         indices = [f.nonzero()[:, 0].tolist() for f in free.parameters]
-        self.learnt = [(list(itertools.islice(places, len(own))), own) for own in indices]
-        mounted = [6 if free.mounts and c > 0 else 0 for c in range(len(observed))]
-        self.mounted = [list(itertools.islice(places, number)) for number in mounted]
-        self.bent = list(itertools.islice(places, 2 if free.bend else 0))
-        self.shared_width = next(places)  # the number of shared unknowns
+        self.learnt = [(self._next_places(len(own)), own) for own in indices]
+        self.mounted = [self._next_places(6 if free.mounts and c > 0 else 0) for c in range(len(observed))]
+        self.bent = self._next_places(2 if free.bend else 0)
         self.is_bent = free.bend or bool((state.bend != 0).any())
         # native code knows one camera that sees flat boards at unknown poses
         is_plain = len(observed) == 1 and free.boards == "poses" and not self.is_bent
@@ -257,6 +254,12 @@ class Bundle:
         # the bound of a focal length only catches failures
         learning = zip(self.cameras, indices, strict=True)
         self.is_bounded = any(camera.fit_bounds and max(own, default=0) >= 4 for camera, own in learning)
+
+    def _next_places(self, count: int) -> list[int]:
+        """Add so many shared unknowns, and return their places."""
+        first = self.shared_width
+        self.shared_width += count
+        return [*range(first, self.shared_width)]
 
     def flat(self, state: State) -> tuple[Tensor, ...]:
         """Return the state as tensors (B, ...)."""
@@ -355,42 +358,31 @@ class Bundle:
         state, by_camera = self.state(flat), self.all_errors(flat, rows)
         if by_camera[0].triangles is not None:
             view, shared = by_camera[0].triangles
-            if self.observed[0].prior:
-                whole = torch.cat((shared, *self._rows_of_priors(state)), -2)
-                shared = torch.linalg.qr(padded(whole), mode="r").R
-            return Equations(view, shared)
-        width, total, parts = self.width, self.shared_width, []
-        for c, errors in enumerate(by_camera):
-            block, at = self.linearised_rows(c, errors, state, rows)
-            if total and len(self.observed) > 1:  # a triangle has fewer rows to spread over the columns of all cameras
-                block = torch.linalg.qr(block, mode="r").R
-                whole = block.new_zeros(*block.shape[:-1], width + total + 1)
-                whole[..., [*range(width), *(width + g for g in at), width + total]] = block
-                block = whole
-            parts.append(block)
-        block = torch.cat(parts, -2)
-        if total == 0:  # at most six columns, for which squares are accurate enough
+            return Equations(view, self._with_priors(shared, state) if self.observed[0].prior else shared)
+        # of all cameras, (B, V, R, L + G + 1)
+        block = torch.cat([self.linearised_rows(c, errors, state, rows) for c, errors in enumerate(by_camera)], -2)
+        if self.shared_width == 0:  # at most six columns, for which squares are accurate enough
             return Equations(triangle_of_few(block), block.new_zeros(len(block), 1, 1))
-        triangle = torch.linalg.qr(padded(block), mode="r").R
-        left = torch.cat((triangle[..., width:, width:].flatten(1, 2), *self._rows_of_priors(state)), -2)
-        shared = torch.linalg.qr(padded(left), mode="r").R
-        return Equations(triangle[..., :width, :], shared)
+        triangle, width = torch.linalg.qr(padded(block), mode="r").R, self.width
+        left = triangle[..., width:, width:].flatten(1, 2)  # what views leave to the shared unknowns
+        return Equations(triangle[..., :width, :], self._with_priors(left, state))
 
-    def _rows_of_priors(self, state: State) -> list[Tensor]:
-        """Return the rows (B, R, G + 1) of each prior."""
-        found = []
+    def _with_priors(self, rows: Tensor, state: State) -> Tensor:
+        """Return the triangle (B, G + 1, G + 1) of rows (B, R, G + 1) and those of the priors."""
+        found = [rows]
         for c, (one, parameters) in enumerate(zip(self.observed, state.parameters, strict=True)):
             if one.prior:
                 centre, root = one.prior
-                rows = root.new_zeros(len(parameters), len(root), self.shared_width + 1)
+                of_prior = root.new_zeros(len(parameters), len(root), self.shared_width + 1)
                 places, own = self.learnt[c]
-                rows[..., places] = root[:, own]
-                rows[..., -1] = (parameters - centre) @ root.mT
-                found.append(rows)
-        return found
+                of_prior[..., places] = root[:, own]
+                of_prior[..., -1] = (parameters - centre) @ root.mT
+                found.append(of_prior)
+        triangle: Tensor = torch.linalg.qr(padded(torch.cat(found, -2)), mode="r").R
+        return triangle
 
-    def linearised_rows(self, c: int, errors: Errors, state: State, rows: Tensor) -> tuple[Tensor, list[int]]:
-        """Return rows (B, V, 2 N, L + F + 1) of a camera, and the indices of its F columns among shared unknowns."""
+    def linearised_rows(self, c: int, errors: Errors, state: State, rows: Tensor) -> Tensor:
+        """Return rows (B, V, R, L + G + 1) of a camera: derivatives by a view's and the shared unknowns, residuals."""
         observed = self.observed_by(c, rows)
         turned, first, points = self.points(c, state, observed)
         batch, views, count = points.shape[:3]
@@ -412,8 +404,15 @@ class Bundle:
             along = by_first @ state.boards.rotations[:, :, None, :, 2:]
             columns.append(along * bend_points(observed.points, state.bend)[1][..., None, :])
         columns.append(errors.residuals[..., None])
-        weighted = torch.cat(columns, -1) * errors.weights.sqrt()[..., None, None]
-        return weighted.flatten(2, 3), [*places, *self.mounted[c], *self.bent]
+        weighted = (torch.cat(columns, -1) * errors.weights.sqrt()[..., None, None]).flatten(2, 3)
+        if self.shared_width == 0 or len(self.observed) == 1:  # the camera has all columns
+            return weighted
+        # a triangle has fewer rows to spread over the columns of all cameras
+        triangle: Tensor = torch.linalg.qr(weighted, mode="r").R
+        spread = triangle.new_zeros(*triangle.shape[:-1], self.width + self.shared_width + 1)
+        shared = [self.width + place for place in (*places, *self.mounted[c], *self.bent)]
+        spread[..., [*range(self.width), *shared, -1]] = triangle
+        return spread
 
     def moved(self, flat: Sequence[Tensor], step: Sequence[Tensor], rows: Tensor) -> tuple[Tensor, ...]:
         """Return the state after steps of the views' unknowns (R, V, L) and the shared ones (R, G)."""
