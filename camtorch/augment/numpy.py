@@ -153,10 +153,7 @@ class Transform(FrontEnd):
         if form is None:
             return self._new_ways(sample, camera)
         key = form, own.mirroring, *own.fields.items()
-        known = self._forms.entry((), key)
-        if known is None:
-            return self._forms((), key, lambda: self._new_ways(sample, camera))
-        ways: dict[str, Way] = known.result
+        ways: dict[str, Way] = self._forms.get((), key, self._new_ways, sample, camera)
         return ways
 
     def _new_ways(self, sample: Sample, camera: Any) -> dict[str, Way]:

@@ -8,7 +8,6 @@
 4. `Batch.moved` moves each other field by itself: `move` calls what the table `KINDS` has for its kind.
 """
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -119,12 +118,8 @@ class SamplePlan:
             labels = _LABELS_OF_MIRRORS if motion.may_mirror else _LABELS_OF_TURNS
         size = motion.image_size
         settings = size, source.dtype, labels, thread_count(), *motion.options.values()
-        known = calls.entry((), settings)
-        if known is None:
-            new = functools.partial(self._new_call, values, part.camera, size, source.dtype, motion.options, labels)
-            of_fields: CallOfFields | None = calls((), settings, new)
-        else:
-            of_fields = known.result
+        how = values, part.camera, size, source.dtype, motion.options, labels
+        of_fields: CallOfFields | None = calls.get((), settings, self._new_call, *how)
         if of_fields is None:
             return {}
         # 4. The call moves its fields, or refuses the values

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import has_tangent, is_cheap_to_read, is_eager, keeps_graph
-from camtorch.evaluate.tensors import are_numbers, known_true
+from camtorch.evaluate.tensors import are_numbers, known_false, known_true
 from camtorch.values.arguments import as_mapping, as_number, shown, warn
 
 RangeLike = float | Sequence[float]
@@ -213,19 +213,19 @@ def checked_draw(draw: Mapping[str, Tensor], ranges: Mapping[str, Range], crops:
     if values["apply"].ndim != 1:
         raise ValueError(f"{owner}: draw['apply'] must be (B,), which of B samples move; got {shown(draw['apply'])}")
     values["apply"] = values["apply"] > 0.5
-    if are_numbers(*values.values()):
-        values = {n: (value if n == "apply" else value.double()).numpy() for n, value in values.items()}
     for name, size in sizes.items():
         value, count = values[name], len(values["apply"])
         shape = (count,) if size is None else (count, size)
         if tuple(value.shape) != shape:
             raise ValueError(f"{owner}: draw[{name!r}] must be {shape}; got shape {tuple(value.shape)}")
-        if isinstance(value, np.ndarray) and not np.isfinite(value).all():
-            raise ValueError(f"{owner}: draw[{name!r}] must be finite; got {value.tolist()}")
-        is_positive = name.rpartition(".")[2] in POSITIVE and ranges[name].low > 0
-        if is_positive and isinstance(value, np.ndarray) and not (value > 0).all():
-            raise ValueError(f"{owner}: draw[{name!r}] must be positive; got {value.tolist()}")
-    return values
+        if known_false(value.isfinite()):
+            raise ValueError(f"{owner}: draw[{name!r}] must be finite; got {value.double().tolist()}")
+        is_positive = name in ranges and name.rpartition(".")[2] in POSITIVE and ranges[name].low > 0
+        if is_positive and known_false(value > 0):
+            raise ValueError(f"{owner}: draw[{name!r}] must be positive; got {value.double().tolist()}")
+    if not are_numbers(*values.values()):
+        return values
+    return {name: (value if name == "apply" else value.double()).numpy() for name, value in values.items()}
 
 
 def chosen_boxes(crops: Mapping[str, int], boxes: Iterable[Tensor] | None, owner: str) -> dict[str, Tensor]:

@@ -228,10 +228,10 @@ class SampleTransform(KeepsCamera, nn.Module):
                 named = moving(sample, fields, self._name)
                 camera = camera_of_images(named, guess, self.needs_camera, self._name)
         form = form_of(sample, camera, fields, self._calls.revision)
-        known = None if form is None else self._calls.plans.entry((), form)
-        if known is not None:
+        plan = None if form is None else self._calls.plans.get((), form)
+        if plan is not None:
             camera = one_or_batch(camera) if camera.intrinsics.ndim > 1 else camera
-            batch = Batch(known.result, sample, camera, must_check=not predicted)
+            batch = Batch(plan, sample, camera, must_check=not predicted)
         else:
             batch = self._new_batch(sample, camera, fields, predicted)
             # a plan reads values from the sample, so none may have been converted

@@ -33,11 +33,11 @@ def as_double_rows(camera: Camera, batch: torch.Size) -> Camera:
     if not camera.batch_shape and all(t.dtype == torch.float64 for t in camera.tensors):
         return camera
     tensors = {}
-    shared = math.prod(camera.batch_shape) == 1
+    shared, rows = math.prod(camera.batch_shape) == 1, math.prod(batch)
     for name in camera.tensor_names:
         tensor = getattr(camera, name).double()
         count = tensor.shape[-1]
-        tensors[name] = tensor.reshape(count) if shared else tensor.expand(*batch, count).reshape(-1, count)
+        tensors[name] = tensor.reshape(count) if shared else tensor.expand(*batch, count).reshape(rows, count)
     return remade(camera, **tensors)
 
 

@@ -66,16 +66,6 @@ class Kept:
         self._kept, self.result = [Entry(key, notes, result), *self._kept[: self.capacity - 1]], result
         return result
 
-    def entry(self, inputs: Sequence[Tensor], key: tuple[Any, ...]) -> Entry | None:
-        """Return what is kept for inputs whose values may be read, or None."""
-        known = self._kept
-        for i, entry in enumerate(known):
-            if key == entry.key and all(map(same, inputs, entry.notes)):
-                if i:  # a new list, as another thread may be reading this one
-                    self._kept = [entry, *known[:i], *known[i + 1 :]]
-                return entry
-        return None
-
     def unless_learning(self, inputs: Sequence[Tensor], key: tuple[Any, ...], compute: Callable[[], T]) -> T:
         """Return `compute()` with its graph if an input learns, else as the call does."""
         learns = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)

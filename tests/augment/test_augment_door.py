@@ -121,6 +121,10 @@ def test_numbers_of_a_draw_that_make_no_camera(camera, name):
         wrong = {**both.draw(2), f"0.{name}": torch.tensor([1.0, value])}
         with pytest.raises(ValueError, match=rf"Compose: draw\['0.{name}'\] must be positive; got"):
             both(image=torch.rand(2, 3, *SIZE), draw=wrong)
+    for value, says in ((0.0, "positive"), (torch.nan, "finite")):  # numbers of a graph too
+        wrong = {**draw, name: torch.tensor([1.0, value], requires_grad=True)}
+        with pytest.raises(ValueError, match=rf"RandomCamera: draw\['{name}'\] must be {says}; got"):
+            augment(image=torch.rand(2, 3, *SIZE), draw=wrong)
 
 
 @pytest.mark.parametrize("as_list", [False, True], ids=["batch", "models"])

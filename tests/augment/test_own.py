@@ -107,6 +107,21 @@ def test_boxes_of_a_sample_come_only_with_it():
     assert out["image"].shape == (3, 24, 24)
 
 
+@pytest.mark.parametrize("name", ["box", "crop"])  # of which the second is a range's, too, in other augmentations
+def test_boxes_of_a_draw(name):
+    class Follows(Facing):
+        crops = MappingProxyType({name: 0})
+
+        def new_camera(self, source, values):
+            return super().new_camera(source, {"box": values[name]})
+
+    boxes = torch.tensor([[[20.0, 15.0, 40.0, 35.0]]])
+    augment = Follows(camera=camera())
+    sample = {"image": torch.rand(1, 3, *SIZE), "boxes": boxes}
+    replayed = augment(sample, draw=augment.with_boxes(augment.draw(1), boxes))
+    assert torch.equal(replayed["image"], augment(sample)["image"])
+
+
 def test_a_face_normalizer_draws_nothing():
     transform = ct.augment.numpy.Transform(ct.augment.FaceNormalizer(camera=camera()))
     with pytest.raises(TypeError, match="draw and generator must be None for a FaceNormalizer"):

@@ -266,6 +266,7 @@ def test_shapes():
     cameras = ct.BrownConrady(camera.intrinsics.repeat(3, 1), camera.distortion.repeat(3, 1))
     found = ct.solve_pnp(cameras, target, pixels).extrinsics.matrix()
     torch.testing.assert_close(found, several.extrinsics.matrix(), rtol=1e-6, atol=1e-6)
+    assert ct.solve_pnp(ct.Pinhole(camera.intrinsics.repeat(3, 1)), target, pixels).rms.shape == (3,)
     empty = ct.solve_pnp(camera, target[:0], pixels[:0])
     assert empty.extrinsics.batch_shape == empty.rms.shape == (0,)
     assert not ct.solve_pnp(camera, target, pixels * torch.nan).valid.any()
