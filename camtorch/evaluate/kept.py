@@ -38,8 +38,9 @@ class Kept:
 
     def __call__(self, inputs: Sequence[Tensor], key: tuple[Any, ...], compute: Callable[[], T]) -> T:
         """Return `compute()` without a graph, or its kept result; it depends on the tensors `inputs` and on `key`."""
-        may_read = not inputs or is_eager(*inputs) or all(is_concrete(t) and not has_tangent(t) for t in inputs)
-        result: T = self.get(inputs, key, compute) if may_read else compute()
+        if inputs and not is_eager(*inputs) and not all(is_concrete(t) and not has_tangent(t) for t in inputs):
+            return compute()
+        result: T = self.get(inputs, key, compute)
         return result
 
     def get(
