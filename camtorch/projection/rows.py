@@ -62,7 +62,8 @@ class CameraRows:
         native = None if self._same_on_cpu is None else self._same_on_cpu.native
         if native is not None:  # its tables are known on the CPU
             tables = native.lenses.tables()
-            known: dict[str, Any] = dict(zip(tables, sent([*tables.values()], self.k.device), strict=True))
+            there = sent([*tables.values()], self.k.device) if tables else ()  # nothing is a transfer, too
+            known: dict[str, Any] = dict(zip(tables, there, strict=True))
             known["inverse_by"] = way_of_inverse(native.plan.is_radial, tables.get("stagewise"))
             return Domain(self.model.optics, self.k, known)
         if self._learns:  # and so will not be used again
