@@ -17,7 +17,7 @@ from camtorch.poses.rotations import rotation_matrix, rotation_vector
 from camtorch.values.arguments import TOLD, broadcast_shapes, warn
 from camtorch.values.module import remade
 from camtorch.warp.boxes import along_edges
-from camtorch.warp.grid import CameraPair
+from camtorch.warp.camera_pair import CameraPair
 
 _ROOT = 1.324717957244746  # plastic number: a low-discrepancy sequence in 2D (R2)
 _SHARE_ERROR = 0.01  # largest error of the share that points measure

@@ -1,4 +1,4 @@
-/* Pixels of cameras to those of others, block by block; the rays in between are turned. warp/grid.py */
+/* Pixels of cameras to those of others, block by block; the rays in between are turned. warp/camera_pair.py */
 
 typedef struct {
     int64_t index; /* of the cameras that these are; -1: none yet */

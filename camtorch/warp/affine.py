@@ -21,7 +21,7 @@ from camtorch.poses.rotations import transposed
 from camtorch.values.arguments import Numbers, as_values, broadcast_shapes
 from camtorch.values.dtypes import SIGNED, as_pixels, narrow, widen
 from camtorch.warp import compiled
-from camtorch.warp.grid import placed
+from camtorch.warp.camera_pair import placed
 from camtorch.warp.lattice import PixelPositions, Positions, coarse, straight_lattice
 from camtorch.warp.options import Options, PaddingMode, Sampler
 from camtorch.warp.panorama import lengths

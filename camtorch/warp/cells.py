@@ -7,7 +7,6 @@ positions of its pixels: `lay_exact` does so, and `lay_quintics`.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -27,10 +26,8 @@ from camtorch.native.structs import (
     CELL_TODO,
     STEP,
 )
+from camtorch.warp.camera_pair import CameraPair
 from camtorch.warp.lattice import Lattice, lagrange, probes
-
-if TYPE_CHECKING:
-    from camtorch.warp.grid import CameraPair
 
 _MISSED_BY_QUINTICS = 5.5 * 5 / 1024
 """How far quintics miss at most, over the nodes' sixth differences: 5 / 1024 if these are even, and 5.5 times as far

@@ -18,7 +18,8 @@ from camtorch.cameras.operators import CameraNumbers, opaque
 from camtorch.evaluate.kept import Kept
 from camtorch.native.sampler import layout
 from camtorch.values.arguments import broadcast_shapes
-from camtorch.warp.grid import CameraPair, locate
+from camtorch.warp.camera_pair import CameraPair
+from camtorch.warp.grid import locate
 from camtorch.warp.options import Sampler
 from camtorch.warp.sampling import render
 

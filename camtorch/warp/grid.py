@@ -1,4 +1,4 @@
-"""Two cameras at one place: pixels of one as pixels of the other, and where a warp samples.
+"""Where a warp between two cameras at one place samples the image of the source.
 
 It samples at exact positions on the source's image, or by a lattice of them where that serves. A lattice may be of a
 part of the target: `first` is the row at which that begins, and `size` its height and width.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from functools import lru_cache
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -18,107 +18,15 @@ from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.door import is_eager, keeps_graph
 from camtorch.evaluate.tensors import is_unknown
-from camtorch.native.structs import CELL_QUINTIC, CELL_TODO, ON_IMAGE, PIXELS, POSITIONS, RADIUS_TABLE, STEP, SURFACE
-from camtorch.poses.rotations import transposed, turn
-from camtorch.projection.evaluation import native_forms
-from camtorch.projection.native_calls import NativeMove
-from camtorch.values.arguments import Numbers, columns
+from camtorch.native.structs import CELL_QUINTIC, CELL_TODO, POSITIONS, RADIUS_TABLE, STEP, SURFACE
+from camtorch.values.arguments import columns
 from camtorch.values.threads import on_one_thread
+from camtorch.warp.camera_pair import CameraPair
 from camtorch.warp.cells import found_by_torch, lay_exact, prefer_quintics
-from camtorch.warp.lattice import FEWEST_CELLS, Lattice, PixelPositions, Positions, probes, to_positions
-from camtorch.warp.panorama import goes_round, lengths, off_poles, seam_of, within_turn
+from camtorch.warp.lattice import FEWEST_CELLS, Lattice, PixelPositions, Positions, probes
+from camtorch.warp.panorama import lengths, seam_of
 
 _STRIP_PIXELS = 1 << 19
-
-
-class CameraPair(NamedTuple):
-    """Two cameras at one place: `ray_target = R ray_source`."""
-
-    source: Camera
-    target: Camera
-    rotation: Tensor | None
-
-    @property
-    def tensors(self) -> list[Tensor]:
-        """All tensors that pixels of the one on the image of the other depend on."""
-        found = [*self.source.tensors, *self.target.tensors]
-        return found if self.rotation is None else [*found, self.rotation]
-
-    @property
-    def back(self) -> CameraPair:
-        """The way from target to source."""
-        return CameraPair(self.target, self.source, None if self.rotation is None else self.rotation.mT)
-
-    @property
-    def goes_round(self) -> bool:
-        """Whether images of one of them show a whole turn, which native code does not wrap."""
-        return goes_round(self.source) is not None or goes_round(self.target) is not None
-
-    def native(self, like: Tensor) -> NativeMove | None:
-        """Return the native geometry from source to target for pixels of the dtype of `like`; None in a graph."""
-        source, target, rotation = self
-        made = native_forms((source, target), like, *(() if rotation is None else (rotation,)))
-        if made is None:
-            return None
-        (start, end), is_batch = made
-        if rotation is not None:
-            is_batch, rotation = is_batch or rotation.ndim == 3, rotation.to(like.dtype)
-        return NativeMove(start, end, rotation, target.size_for("Warp"), is_batch)
-
-    def move(self, pixels: Numbers, on_image: bool = False) -> tuple[Tensor, Tensor]:
-        """Return pixels (B, *N, 2) or (*N, 2) of the source as pixels of the target, (-1, -1) for none, and validity.
-
-        on_image: whether only pixels on the target's image are valid.
-        """
-        if isinstance(pixels, Tensor) and pixels.ndim > 0 and pixels.shape[-1] == 2:
-            ready = self.native(pixels)
-            if ready is not None and ((pixels.ndim > 1 and pixels.shape[0] == ready.cameras) or not ready.is_batch):
-                moved, valid = ready.rows(pixels.reshape(ready.cameras, -1, 2), ON_IMAGE if on_image else PIXELS)
-                return moved.view(pixels.shape), valid.view(pixels.shape[:-1])
-        rays, has_ray = self.source.unproject(pixels)
-        moved, mapped = self.target.project(turn(self.rotation, rays, "pixels"))
-        return placed(self.target, moved, mapped & has_ray, on_image)
-
-    @property
-    def like(self) -> Tensor:
-        """A tensor of the dtype and on the device to compute with the target's pixels in."""
-        like = self.target.intrinsics
-        return like if like.dtype.itemsize >= 4 else like.float()
-
-    def pixels_of(self, rows: range) -> Tensor:
-        """Return the centres (len(rows), W', 2) of the target's pixels."""
-        like = self.like
-        v = torch.arange(rows.start, rows.stop, dtype=like.dtype, device=like.device)
-        u = torch.arange(self.target.size_for("Warp")[1], dtype=like.dtype, device=like.device)
-        return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
-
-    def native_positions(self) -> NativeMove | None:
-        """Return the native geometry from target to source; None in a graph, and for images of a whole turn."""
-        return None if self.goes_round else self.back.native(self.like)
-
-    def exact(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return where the source sees pixels of the target, by torch.
-
-        Pixels (h, w, 2) are those of every camera, and (B, h, w, 2) of each its own. Returns positions (B or 1, h, w,
-        2) as of `grid_sample`, `OUTSIDE` where no ray is mapped, and bool (B or 1, h, w): whether one is.
-        """
-        source, target, rotation = self
-        if pixels.ndim == 3 and target.batch_shape:
-            pixels = pixels.expand(*target.batch_shape, *pixels.shape)
-        rays, has_ray = target.unproject(within_turn(target, pixels))
-        if rays.ndim == 3:
-            rays, has_ray = rays.unsqueeze(0), has_ray.unsqueeze(0)
-        rays = turn(transposed(rotation), rays, "rays")
-        seen, mapped = source.project(off_poles(source, rays))
-        del rays
-        mapped = mapped & has_ray
-        return to_positions(seen, mapped, source.size_for("Warp")), mapped
-
-
-def placed(camera: Camera, pixels: Tensor, valid: Tensor, on_image: bool) -> tuple[Tensor, Tensor]:
-    """Return pixels, (-1, -1) for those not valid, and which are valid: if `on_image`, those on the camera's image."""
-    pixels = torch.where(valid.unsqueeze(-1), pixels, -1.0)
-    return pixels, valid & camera.contains(pixels) if on_image else valid
 
 
 @on_one_thread

@@ -14,7 +14,8 @@ from camtorch.evaluate.tensors import as_own, known_false, values_of
 from camtorch.poses.extrinsics import Extrinsics
 from camtorch.poses.rotations import rotation_matrix, turn
 from camtorch.values.arguments import Numbers, as_batch, as_coordinates, as_number, as_real, shown
-from camtorch.warp.grid import placed, scaled_rows
+from camtorch.warp.camera_pair import placed
+from camtorch.warp.grid import scaled_rows
 from camtorch.warp.lattice import PixelPositions, to_positions
 from camtorch.warp.options import PaddingMode, WarpOptions
 from camtorch.warp.panorama import off_poles

@@ -43,7 +43,8 @@ from camtorch.projection.native_cameras import Native
 from camtorch.values.arguments import Numbers, broadcast_shapes
 from camtorch.values.module import GeometryModule
 from camtorch.warp import compiled
-from camtorch.warp.grid import CameraPair, local_scale, locate
+from camtorch.warp.camera_pair import CameraPair
+from camtorch.warp.grid import local_scale, locate
 from camtorch.warp.lattice import PixelPositions, Positions
 from camtorch.warp.options import Mode, Options, PaddingMode, Sampler, serving_all
 from camtorch.warp.panorama import Seam, seam_of

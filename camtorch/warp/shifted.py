@@ -9,7 +9,7 @@ from torch.nn.functional import max_pool2d
 
 from camtorch.cameras.camera import Camera
 from camtorch.rays.depth import depth_scale
-from camtorch.warp.grid import placed
+from camtorch.warp.camera_pair import placed
 from camtorch.warp.lattice import PixelPositions, to_positions
 from camtorch.warp.options import PaddingMode
 from camtorch.warp.warp import Warp

@@ -25,7 +25,7 @@ from camtorch.values.arguments import (
 )
 from camtorch.values.module import GeometryModule
 from camtorch.warp.affine import HalvingWarp
-from camtorch.warp.grid import CameraPair
+from camtorch.warp.camera_pair import CameraPair
 from camtorch.warp.options import TolerantOptions
 from camtorch.warp.warp import Warp
 

@@ -16,6 +16,7 @@ from camtorch.native import sampler
 from camtorch.native.library import native_available
 from camtorch.native.structs import CELL_CUBIC, CELL_EMPTY, CELL_QUINTIC
 from camtorch.warp import cells, grid
+from camtorch.warp.camera_pair import CameraPair
 from camtorch.warp.lattice import Lattice
 
 TOLERANCES = (0.1, 0.01)
@@ -28,7 +29,7 @@ def way(request, monkeypatch):
         pytest.skip("there is no compiled library")
     if request.param == "torch":
         monkeypatch.setattr(cells, "native_available", lambda: False)
-        monkeypatch.setattr(grid.CameraPair, "native_positions", lambda _: None)
+        monkeypatch.setattr(CameraPair, "native_positions", lambda _: None)
 
 
 def check(source, target, rotation):
@@ -90,11 +91,11 @@ def test_torch_doubts_the_cells_that_compiled_code_doubts(key, monkeypatch):
 
     for pair in ((camera, target), (target, camera), (camera, camera)):
         for padding, tolerance in (("zeros", 1e-3), ("border", 1e-3), ("reflection", 0.1)):
-            given = grid.CameraPair(*pair, rotation), range(240), tolerance, padding
+            given = CameraPair(*pair, rotation), range(240), tolerance, padding
             compiled = grid.on_lattice(*given)
             with monkeypatch.context() as patch:
                 patch.setattr(cells, "native_available", lambda: False)
-                patch.setattr(grid.CameraPair, "native_positions", lambda _: None)
+                patch.setattr(CameraPair, "native_positions", lambda _: None)
                 patch.setattr(cells, "classify", both)
                 patch.setattr(cells, "are_smooth", lambda *_: False)
                 laid = grid.on_lattice(*given)
