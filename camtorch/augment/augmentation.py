@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Unpack
 
 import torch
 from torch import Tensor
-from typing_extensions import Unpack
 
 from camtorch.augment.cameras import known_camera
 from camtorch.augment.change import Change, by_models, check_sizes, one_or_batch

@@ -1,10 +1,10 @@
 """Crops that look at a box of each sample, such as a face, without perspective error; labels and camera follow."""
 
 from collections.abc import Mapping, Sequence
+from typing import Unpack
 
 import torch
 from torch import Tensor
-from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.ranges import TURN, RangeLike, as_range

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Unpack
 
 import torch
 from torch import Tensor
-from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.devices import twin_of

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
-from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions, FlipOptions
 from camtorch.augment.change import Change, by_models

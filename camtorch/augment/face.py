@@ -1,12 +1,11 @@
 """The data normalisation of gaze estimation, for any lens."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Unpack
 
 import numpy as np
 import torch
 from torch import Tensor
-from typing_extensions import Unpack
 
 from camtorch.augment.change import Change, one_or_batch
 from camtorch.augment.fields import PLACE

@@ -2,11 +2,10 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Unpack
 
 import torch
 from torch import Tensor
-from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.drawer import Auto, CameraDrawer, LensOptions

@@ -5,11 +5,10 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, ParamSpec, TypedDict, TypeVar, cast
+from typing import Any, ClassVar, ParamSpec, Self, TypedDict, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from camtorch.augment.cameras import Unknown, camera_of_images
 from camtorch.augment.change import Change, one_or_batch

@@ -1,10 +1,9 @@
 """A random rolling shutter in front of the camera of a sample."""
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, Unpack
 
 import torch
-from typing_extensions import Unpack
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.part import Part

@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
-from typing_extensions import Self, TypeVar
 
 from camtorch.cameras.catalogue import Catalogue
 from camtorch.cameras.editing import Editable
@@ -37,7 +36,10 @@ from camtorch.rays.polyline import project_polyline
 from camtorch.values.arguments import Numbers, broadcast_shapes, hinting, warn
 from camtorch.values.module import GeometryModule, typed_as
 
-Model = TypeVar("Model", bound="Camera", default="Camera")
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar  # which has defaults on each Python; checkers of types bring it
+
+    Model = TypeVar("Model", bound="Camera", default="Camera")
 
 
 MODELS: Catalogue[type[Camera]] = Catalogue()

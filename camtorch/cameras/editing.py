@@ -1,12 +1,11 @@
 """The camera of an edited image: cropped, padded, scaled, flipped, turned by quarters."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeVar, cast
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
 from camtorch.cameras.image_sizes import warn_of_exchange
 from camtorch.evaluate.tensors import are_numbers, known_false, known_true

@@ -1,11 +1,10 @@
 """Parameters of a camera that are frozen by name, while the others learn."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
 from camtorch.evaluate.tensors import may_write
 from camtorch.projection.camera_like import CameraLike

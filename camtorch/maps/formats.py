@@ -5,9 +5,7 @@ To add a format, write one file in this folder, as `protocol.py` explains, and n
 
 import json
 import os
-from typing import Any, Literal, TypedDict
-
-from typing_extensions import Unpack
+from typing import Any, Literal, TypedDict, Unpack
 
 from camtorch.io.parsing import path_of, read_bytes
 from camtorch.io.record import CameraFileError

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import MappingProxyType
-from typing import ClassVar, cast
+from typing import ClassVar, Self, cast
 
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import known_false, known_true

@@ -1,10 +1,10 @@
 """The Kannala-Brandt fisheye camera, OpenCV's: r = theta (1 + k1 theta^2 + k2 theta^4 + ...)."""
 
 from collections.abc import Sequence
+from typing import Self
 
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
 from camtorch.evaluate.tensors import known_false
 from camtorch.models._polynomial import OddPolynomial

@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 from types import MappingProxyType
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import known_false

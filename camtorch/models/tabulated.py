@@ -3,10 +3,10 @@
 import math
 from collections.abc import Sequence
 from types import MappingProxyType
+from typing import Self
 
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
 from camtorch.optics import Chart, EquidistantUpTo, Lens, Planar, RadiusTable

@@ -1,9 +1,7 @@
 """The fisheye of the WoodScape data set: r = theta (1 + k2 theta + k3 theta^2 + k4 theta^3)."""
 
 from collections.abc import Sequence
-from typing import ClassVar
-
-from typing_extensions import Self
+from typing import ClassVar, Self
 
 from camtorch.models._polynomial import FreePolynomial
 from camtorch.models.f_theta import FTheta

@@ -2,11 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal, TypedDict, overload
+from typing import Literal, TypedDict, Unpack, overload
 
 import torch
 from torch import Tensor
-from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import (

@@ -7,9 +7,7 @@ import difflib
 import functools
 import inspect
 from collections.abc import Iterable
-from typing import Any, get_args, get_origin, get_type_hints
-
-from typing_extensions import Unpack
+from typing import Any, Unpack, get_args, get_origin, get_type_hints
 
 from camtorch.values.arguments import CLOSE, LEFT
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any, Unpack, cast
 
 import torch
 from torch import Tensor
-from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import keeps_graph

@@ -2,11 +2,10 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, Unpack
 
 import torch
 from torch import Tensor, nn
-from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.image_sizes import warn_of_exchange

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor
-from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import as_own, known_false, values_of

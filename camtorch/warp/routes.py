@@ -15,11 +15,10 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import (

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, Unpack, cast, get_args
 
 import torch
 from torch import Tensor
-from typing_extensions import Unpack
 
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import as_own, known_false, values_of

@@ -2,13 +2,12 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, assert_type
 
 import numpy as np
 import PIL.Image
 import torch
 from torch import Tensor, nn
-from typing_extensions import assert_type
 
 import camtorch as ct
 from camtorch.convert.result import Conversion
