@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Unpack
 
@@ -14,7 +13,7 @@ from camtorch.augment.cameras import known_camera
 from camtorch.augment.change import Change, by_models, check_sizes, one_or_batch
 from camtorch.augment.devices import Elsewhere, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
-from camtorch.augment.filling import enough, scaled, warn_if_empty, warn_of_unfilled
+from camtorch.augment.filling import enough, scaled, tell_of_narrow_images, warn_if_empty, warn_of_unfilled
 from camtorch.augment.matrices import Guess
 from camtorch.augment.part import Part
 from camtorch.augment.ranges import (
@@ -90,6 +89,14 @@ class Augmentation(SampleTransform):
     """The names of ranges that change the colours or the light of new images, not their camera."""
     keeps_lens: ClassVar[bool] = False
     """Whether it may come after a lens with chromatic aberration or vignetting in a `Compose`."""
+    goes_last: ClassVar[bool] = False
+    """Whether nothing may come after it in a `Compose`."""
+    needs_depth: bool = False
+    """Whether samples need a depth, so that it is in no `Compose`."""
+    _labels_in_draws: ClassVar[Sequence[str]] = ()
+    """The names of labels of samples that a draw may hold besides ranges and `crops`."""
+    _least_fov: float | None = None
+    """Degrees that new images are to be wide at least: a warning tells if `min_filled` makes them narrower."""
     image_size: tuple[int, int] | None = None
     """(height, width) of new images; None: that of the images."""
     drawn_on_host: bool = False
@@ -113,13 +120,15 @@ class Augmentation(SampleTransform):
     ):
         super().__init__(**options)
         self.p = p
-        self.same_on_batch = as_flag(same_on_batch, "same_on_batch", self._name)
+        self.same_on_batch = same_on_batch
         self.ranges = dict(ranges or {})
         self.min_filled = min_filled
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "p":
             value = as_part(value, name, self._name, "probability")
+        elif name == "same_on_batch":
+            value = as_flag(value, name, self._name)
         elif name == "min_filled" and value is not None:
             value = as_part(value, name, self._name)
         super().__setattr__(name, value)
@@ -176,20 +185,19 @@ class Augmentation(SampleTransform):
     # crops, place             Compose; BoxCrop sets them when it is made
     # drawn_on_host            edits, lenses and mounts; Compose
     # beside_the_camera        lenses and mounts: colours and light
-    # keeps_lens               RandomShutter
+    # _least_fov                lenses and mounts
+    # keeps_lens, goes_last    RandomShutter
+    # needs_depth              RandomMount
+    # _labels_in_draws          RandomMount, for the depths of a shift
     # other_words              lenses and mounts
     # _warp_options            Edit, whose warps choose what to antialias
     # _draw_numbers            Compose, of all in it
     # _with_labels             RandomMount, for the depths of a shift; here boxes, for `crops`
-    # _checked_draw            RandomMount, of a draw that was given
     # _change                  Compose, step by step; Edit, by a matrix
     # _part                    lenses and mounts, by C; RandomMount with a shift; RandomShutter
     # _new_camera              lenses and mounts, whose formulas take float64
-    # _part_between            lenses and mounts, with colours and light
-    # _tell_of                 lenses and mounts, of a field of view that was asked for
     # tell_of_empty_images     Compose, of all in it
     # _size_if_applied         edits; Compose, of all in it
-    # _chain_error             RandomMount with a shift; RandomShutter; Compose
 
     def _draw_numbers(self, count: int, p: float, same_on_batch: bool, generator: torch.Generator | None) -> Draw:
         """Return a draw as lists, arrays or tensors; see `ranges.py`."""
@@ -218,7 +226,14 @@ class Augmentation(SampleTransform):
         if before is None or isinstance(before, (int, float)):
             how = f"give one here, in the sample, or as {self._name}(camera=...)"
             raise ValueError(f"{self._name}: camera must be given; got {before}. Please {how}. {GUESS_CAMERA}")
-        return self._change_on_host(one_or_batch(before), self._checked_draw(draw))
+        before = one_or_batch(before)
+        checked = checked_draw(draw, self.ranges, self.crops, self._labels_in_draws, self._name)
+        if before.batch_shape and len(before) != len(checked["apply"]):
+            raise ValueError(
+                f"{self._name}: draw must be for {len(before)} samples, as the cameras; got one for "
+                f"{len(checked['apply'])}"
+            )
+        return self._change_on_host(before, checked)
 
     def _change_on_host(self, camera: Camera, draw: Draw) -> Change:
         """Return the change of a draw, computed on the CPU also for fixed cameras elsewhere, if the draw is there."""
@@ -239,68 +254,51 @@ class Augmentation(SampleTransform):
                 f"{self._name}: with p < 1 the image_size must be that of the images, so that all come out alike; "
                 f"got image_size={self.image_size} for images of {camera.image_size}"
             )
-        applied, count = draw["apply"], len(draw["apply"])
+        applied = draw["apply"]
         chosen = applied if isinstance(applied, list) else which_apply(applied)
-        if chosen is not None and not all(chosen):
-            return self._change_of_some(camera, draw, chosen)
         # if values may not be read, all rows are moved, and `gate` later keeps those that were not drawn
         gate = applied if chosen is None and self.p != 1 else None
-        if not isinstance(camera, Mixed):
-            return Change(count, [self._part(camera, draw)], gate=gate)
-        return by_models(count, camera, lambda rows, source: self._part(source, rows_of(draw, rows)), gate)
+        all_move = chosen is None or all(chosen)
+        if all_move and not isinstance(camera, Mixed):
+            return Change(len(applied), [self._part(camera, draw)], gate=gate)
 
-    def _change_of_some(self, camera: Camera, draw: Draw, chosen: Sequence[bool]) -> Change:
-        """Return the change that moves only the chosen samples."""
-        count, parts = len(chosen), []
-        camera = one_or_batch(camera)
-        for rows, group in camera.groups if isinstance(camera, Mixed) else [(list(range(count)), camera)]:
-            for moves in (True, False):
-                here = [n for n, row in enumerate(rows) if chosen[row] == moves]
-                if here:
-                    source = group[here] if group.batch_shape and len(here) < len(rows) else group
-                    samples = [rows[n] for n in here]
-                    part = self._part(source, rows_of(draw, samples)) if moves else Part(source)
-                    parts.append(replace(part, rows=samples))
-        check_sizes((part.image_size for part in parts), self._name)
-        return Change(count, parts, mixed=isinstance(camera, Mixed))
+        def part(rows: list[int] | None, source: Camera) -> Part:
+            return self._part(source, rows_of(draw, rows))
 
-    def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
-        """Return what parts of a `Compose` must do if this one, called `name`, cannot precede `later` ones; or None."""
-        colours = self.beside_the_camera.intersection(self.ranges)
-        if colours and any(part.needs_camera and not part.keeps_lens for part in later):
-            return f"be edits after {' and '.join(sorted(colours))}, which another lens would show"
-        return None
-
-    def _checked_draw(self, draw: Mapping[str, Tensor]) -> Draw:
-        """Return a draw that was given as arrays, or as tensors if numbers may not be read."""
-        return checked_draw(draw, self.ranges, self.crops, self._name)
+        change = by_models(len(applied), camera, part, chosen, gate)
+        if not all_move:
+            check_sizes((part.image_size for part in change.parts), self._name)
+        return change
 
     def _part(self, source: Camera, draw: Draw) -> Part:
-        return self._part_by_torch(source, values_for(source, draw))
+        """Return how samples of cameras of one model move, all of them, by a draw for as many."""
+        target, rotation = self._filled_camera(source, values_for(source, draw))
+        return Part(source, Warp(source, target, rotation, **self._warp_options))
 
-    def _part_by_torch(self, source: Camera, values: Mapping[str, Any]) -> Part:
+    def _filled_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
+        """Return the camera of drawn values and its rotation, zoomed and turned less far for `min_filled`."""
         target, rotation = self._new_camera(source, values)
         if self.min_filled:
             factor, turned, found = enough(source, target, rotation, self.min_filled)
             target, rotation = scaled(target, factor), None if rotation is None else turned
-            self._tell_of(source, lambda: target, factor, found)
-        return self._part_between(source, target, rotation, values)
-
-    def _part_between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
-        """Return the part from a source to a target; `values` may change images in more ways, such as their light."""
-        return Part(source, Warp(source, target, rotation, **self._warp_options))
+            self._tell_of_unfilled(source, lambda: target, factor, found)
+        return target, rotation
 
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         """Call `new_camera` with values as drawn."""
         return self.new_camera(source, as_tensors(source, values))
 
-    def _tell_of(self, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor) -> None:
-        """Warn, once, if filled parts (*B,) are less than `min_filled` with these factors (*B,) on focal lengths."""
+    def _tell_of_unfilled(self, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor) -> None:
+        """Warn, once, if `min_filled` is out of reach, or leaves less than a field of view that was asked for.
+
+        target: returns the new cameras, zoomed by factors (*B,) and then filled to the parts `found` (*B,).
+        """
         share = self.min_filled or 0.0
-        if self._calls.has_looked or not known_false(found >= share):
-            return
-        self._calls.has_looked = True
-        warn_of_unfilled(self._name, share, found)
+        if not self._calls.has_looked and known_false(found >= share):
+            self._calls.has_looked = True
+            warn_of_unfilled(self._name, share, found)
+        if self._least_fov is not None:
+            tell_of_narrow_images(self._name, self._least_fov, share, source, target, factor, found)
 
     def tell_of_empty_images(self, camera: Camera) -> None:
         """Warn, once, if new images of `camera` will be mostly empty; draws from a generator of its own show it."""

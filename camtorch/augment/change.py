@@ -383,17 +383,35 @@ class Change:
 
 
 def by_models(
-    count: int, camera: Camera, part: Callable[[list[int] | None, Camera], Part], gate: Tensor | None = None
+    count: int,
+    camera: Camera,
+    part: Callable[[list[int] | None, Camera], Part],
+    chosen: Sequence[bool] | None = None,
+    gate: Tensor | None = None,
 ) -> Change:
     """Return the change of `count` samples, with one part for each camera model of the batch.
 
-    `part` is called with the rows of a model's samples, None for all, and with their cameras.
+    Args:
+        count: how many samples.
+        camera: of all samples, or a batch of theirs.
+        part: (rows, cameras) -> part: which samples of a model move, None for all, and their cameras.
+        chosen: (count,): which samples move; the others stay, in parts of their own. None: all move.
+        gate: see `Change`.
     """
     camera = one_or_batch(camera)
-    if not isinstance(camera, Mixed):
+    moves = [True] * count if chosen is None else chosen
+    all_move = all(moves)
+    if all_move and not isinstance(camera, Mixed):
         return Change(count, [part(None, camera)], gate=gate)
-    parts = [replace(part(rows, source), rows=rows) for rows, source in camera.groups]
-    return Change(count, parts, mixed=True, gate=gate)
+    parts = []
+    for rows, group in camera.groups if isinstance(camera, Mixed) else [(list(range(count)), camera)]:
+        for do_move in (True, False):
+            here = [n for n, row in enumerate(rows) if moves[row] == do_move]
+            if here:
+                samples = [rows[n] for n in here]
+                source = group[here] if group.batch_shape and len(here) < len(rows) else group
+                parts.append(replace(part(samples, source) if do_move else Part(source), rows=samples))
+    return Change(count, parts, mixed=isinstance(camera, Mixed), gate=gate)
 
 
 def one_or_batch(camera: Camera | Sequence[Camera]) -> Camera:

@@ -14,6 +14,7 @@ from camtorch.augment.edits import Edit, change_by
 from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.ranges import Draw, Range, draw_numbers
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.tensors import are_concrete
 from camtorch.values.arguments import as_mapping, present
 
 T = TypeVar("T")
@@ -89,13 +90,10 @@ class Compose(Augmentation):
                         f"{self._name}: images are sampled once, so parts must have one {key}; got {given[key]!r} of "
                         f"{kind}. Pass it to {self._name} itself"
                     )
-            error = part._chain_error(parts[i + 1 :], kind)
+            errors = (_order_error(leaf, parts[i + 1 :], kind) for leaf in reversed(_leaves(part)))
+            error = next(filter(None, errors), None)
             if error is not None:
                 raise ValueError(f"{self._name}: parts must {error}; got {kind} at place {i}")
-
-    def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
-        errors = (part._chain_error(later, name) for part in reversed(self.parts))
-        return next(filter(None, errors), None)
 
     @property  # type: ignore[override]
     def ranges(self) -> Mapping[str, Range]:
@@ -156,6 +154,7 @@ class Compose(Augmentation):
         # a chain shows what the first camera sees, also where a later one, as of a crop, sees less
         for part in self.parts:
             part.tell_of_empty_images(camera)
+        self._calls.has_looked = are_concrete(camera.intrinsics)
 
     def _change(self, camera: Camera, draw: Draw) -> Change:
         parts = self.parts
@@ -183,6 +182,23 @@ class Compose(Augmentation):
     def extra_repr(self) -> str:
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())
+
+
+def _leaves(part: Augmentation) -> list[Augmentation]:
+    """Return an augmentation, or all that a `Compose` holds."""
+    return [leaf for each in part.parts for leaf in _leaves(each)] if isinstance(part, Compose) else [part]
+
+
+def _order_error(part: Augmentation, later: Sequence[Augmentation], name: str) -> str | None:
+    """Return what parts must do if one, in the part called `name`, cannot precede `later` ones; or None."""
+    if part.goes_last and later:
+        return f"move no rows of a rolling shutter: {name} goes last"
+    if part.needs_depth:
+        return f"have no shift, which needs depth: {name} goes before"
+    colours = part.beside_the_camera.intersection(part.ranges)
+    if colours and any(other.needs_camera and not other.keeps_lens for other in later):
+        return f"be edits after {' and '.join(sorted(colours))}, which another lens would show"
+    return None
 
 
 def _by_index(parts: Iterable[Mapping[str, T]]) -> Mapping[str, T]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal, Unpack
 
 import torch
@@ -11,10 +11,10 @@ from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.devices import twin_of
-from camtorch.augment.filling import enough, scaled, tell_of_narrow_images
+from camtorch.augment.filling import enough, scaled
 from camtorch.augment.jitter import jittered
 from camtorch.augment.native_draws import DRAWN_KINDS, Start, Wanted, too_wide
-from camtorch.augment.part import Part
+from camtorch.augment.part import LazyWarp, Part
 from camtorch.augment.presets import REAL, as_like
 from camtorch.augment.ranges import TURN, Draw, Range, RangeLike, as_range, as_tensors, values_for
 from camtorch.cameras.camera import Camera
@@ -156,22 +156,45 @@ class CameraDrawer(Augmentation):
 
     drawn_on_host = _keeps_formulas  # the formulas take numbers alone
 
+    @property
+    def _least_fov(self) -> float | None:  # type: ignore[override]
+        if self._among is not None:
+            return self._among[0]
+        return self.ranges["fov"].low if "fov" in self.ranges else None
+
     def _part(self, source: Camera, draw: Draw) -> Part:
         values = values_for(source, draw)
         # a draw is of tensors where something is recorded
         start = None if isinstance(draw["apply"], Tensor) else self._start(source, values)
         if start is None:
-            return self._part_by_torch(source, values)
-        made = start.warp(source, values, self._warp_options)
-        if self.min_filled:
-            are_filled = min(made.filled, default=1) >= self.min_filled
-            if not are_filled or max(made.zooms, default=1) > 1:
-                self._tell_of(source, lambda: made.target, torch.tensor([*made.zooms]), torch.tensor([*made.filled]))
-        options = self.options
-        may_stay_lazy = made.natives is not None and options["tolerance"] and not options["antialias"]
-        if may_stay_lazy and self.beside_the_camera.isdisjoint(self.ranges):
-            return Part(source, made)  # of numbers, which become a `Warp` at first use
-        return self._part_between(source, made.target, made.rotation, values)
+            target, rotation = self._filled_camera(source, values)
+        else:
+            made = start.warp(source, values, self._warp_options)
+            if self.min_filled:
+                self._tell_if_zoomed(source, made)
+            options = self.options
+            may_stay_lazy = made.natives is not None and options["tolerance"] and not options["antialias"]
+            if may_stay_lazy and self.beside_the_camera.isdisjoint(self.ranges):
+                return Part(source, made)  # of numbers, which become a `Warp` at first use
+            target, rotation = made.target, made.rotation
+        beside = as_tensors(source, {name: values[name] for name in self.beside_the_camera.intersection(values)})
+        cameras, light = [target], None
+        if "chromatic" in beside:  # red and blue are seen by cameras of their own
+            cameras += [scaled(target, 1 + beside["chromatic"][..., i]) for i in (0, 1)]
+        warp, *others = [Warp.of_valid(source, camera, self._warp_options).turned_by(rotation) for camera in cameras]
+        if "vignetting" in beside:
+            light = falloff(target, beside["vignetting"])
+        if "cos4" in beside:
+            natural = vignetting(target, beside["cos4"])
+            light = natural if light is None else light * natural
+        return Part(source, warp, (others[0], others[1]) if others else None, light)
+
+    def _tell_if_zoomed(self, source: Camera, made: LazyWarp) -> None:
+        """Warn of what native code found for `min_filled`, if it took a zoom, or more than there is."""
+        are_filled = min(made.filled, default=1) >= (self.min_filled or 0.0)
+        if not are_filled or max(made.zooms, default=1) > 1:
+            zooms, filled = torch.tensor([*made.zooms]), torch.tensor([*made.filled])
+            self._tell_of_unfilled(source, lambda: made.target, zooms, filled)
 
     def _start(self, source: Camera, values: Mapping[str, Any]) -> Start | None:
         """Return what native code starts from for values of these names, kept while the cameras' numbers stay.
@@ -303,26 +326,6 @@ class CameraDrawer(Augmentation):
 
     def _size_of(self, source: Camera) -> tuple[int, int]:
         return self.image_size or source.size_for(self._name)
-
-    def _part_between(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
-        """Return the part with the effect of the lens on colours and light."""
-        beside = as_tensors(source, {name: values[name] for name in self.beside_the_camera.intersection(values)})
-        cameras, light = [target], None
-        if "chromatic" in beside:  # red and blue are seen by cameras of their own
-            cameras += [scaled(target, 1 + beside["chromatic"][..., i]) for i in (0, 1)]
-        warp, *others = [Warp.of_valid(source, camera, self._warp_options).turned_by(rotation) for camera in cameras]
-        if "vignetting" in beside:
-            light = falloff(target, beside["vignetting"])
-        if "cos4" in beside:
-            natural = vignetting(target, beside["cos4"])
-            light = natural if light is None else light * natural
-        return Part(source, warp, (others[0], others[1]) if others else None, light)
-
-    def _tell_of(self, source: Camera, target: Callable[[], Camera], factor: Tensor, found: Tensor) -> None:
-        super()._tell_of(source, target, factor, found)
-        least = self._among[0] if self._among else self.ranges["fov"].low if "fov" in self.ranges else None
-        if least is not None:
-            tell_of_narrow_images(self._name, least, self.min_filled or 0.0, source, target, factor, found)
 
 
 def _joined(numbers: Sequence[Tensor], example: Tensor) -> Tensor:

@@ -145,7 +145,7 @@ class Part:
         return replace(self.with_warps(taken), rows=None, camera=camera, light=light)
 
     def then(self, second: Part) -> Part:
-        """Return one part that does with one warp what this and another one of the same rows do in turn."""
+        """Return one part that does with one warp, by the options of the second, what both do in turn."""
         first, last = self.motion, second.motion
         if last is None:
             return self
@@ -167,7 +167,7 @@ class Part:
             natives = first.natives if first.is_drawn else None
             native = _single(self.camera) if natives is None else natives[0]
             return replace(second, camera=self.camera, motion=last.starting_at(native, rotation))
-        moved = second.with_warps(lambda warp: HalvingWarp(self.camera, warp.target, rotation))
+        moved = second.with_warps(lambda warp: HalvingWarp(self.camera, warp.target, rotation, **warp.options))
         return replace(moved, camera=self.camera)
 
     def _edited(self, edit: AffineWarp, rotation: Tensor | None) -> Part:
@@ -175,10 +175,14 @@ class Part:
         size = edit.target.image_size
         if isinstance(self.motion, AffineWarp):
             matrix = after(edit.map, self.motion.map)
-            return replace(self, motion=AffineWarp(self.camera, edited(self.camera, matrix, size), matrix, rotation))
+            target = edited(self.camera, matrix, size)
+            return replace(self, motion=AffineWarp(self.camera, target, matrix, rotation, **edit.options))
+
+        def with_edit(warp: Warp) -> Warp:
+            return HalvingWarp(self.camera, edited(warp.target, edit.map, size), rotation, **edit.options)
+
         light = None if self.light is None else edit(self.light, padding_mode="border")
-        moved = self.with_warps(lambda warp: HalvingWarp(self.camera, edited(warp.target, edit.map, size), rotation))
-        return replace(moved, light=light)
+        return replace(self.with_warps(with_edit), light=light)
 
 
 def _turned(first: Tensor | None, second: Tensor | None) -> Tensor | None:

@@ -5,9 +5,7 @@ from dataclasses import replace
 from typing import ClassVar, Literal, Unpack
 
 import torch
-from torch import Tensor
 
-from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.drawer import Auto, CameraDrawer, LensOptions
 from camtorch.augment.fields import Named
 from camtorch.augment.part import Part
@@ -116,6 +114,8 @@ class RandomMount(CameraDrawer):
     hidden are empty and not valid; pixels move by their depth, points and poses exactly. There is no `inverse`.
     """
 
+    _labels_in_draws: ClassVar[Sequence[str]] = tuple(_DEPTHS)
+
     def __init__(
         self,
         *,
@@ -139,9 +139,14 @@ class RandomMount(CameraDrawer):
         for name, each in zip(_SHIFTS, shift, strict=True):
             self.ranges[name] = as_range(each, "shift", self._name)
 
+    @property
+    def needs_depth(self) -> bool:  # type: ignore[override]
+        """Whether it shifts."""
+        return _SHIFTS[0] in self.ranges
+
     def _with_labels(self, draw: Draw, rows: Callable[[], Named]) -> Draw:
         draw = super()._with_labels(draw, rows)
-        if _SHIFTS[0] not in self.ranges:
+        if not self.needs_depth:
             return draw
         named = rows()
         for key, (field, _) in _DEPTHS.items():
@@ -156,16 +161,8 @@ class RandomMount(CameraDrawer):
             f"against far ones; got {', '.join(named)}. Without shift, yaw, pitch, roll and zoom are exact"
         )
 
-    def _checked_draw(self, draw: Mapping[str, Tensor]) -> Draw:
-        return {**super()._checked_draw(draw), **{key: draw[key] for key in _DEPTHS if key in draw}}
-
-    def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
-        if _SHIFTS[0] in self.ranges:
-            return f"have no shift, which needs depth: {name} goes before"
-        return super()._chain_error(later, name)
-
     def _part(self, source: Camera, draw: Draw) -> Part:
-        if _SHIFTS[0] not in self.ranges:
+        if not self.needs_depth:
             return super()._part(source, draw)
         key = next((key for key in _DEPTHS if key in draw), None)
         if key is None:

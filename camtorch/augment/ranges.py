@@ -198,18 +198,25 @@ def as_tensors(source: Camera, values: Mapping[str, Any]) -> dict[str, Tensor]:
     return {n: torch.as_tensor(value, dtype=dtype, device=source.intrinsics.device) for n, value in values.items()}
 
 
-def checked_draw(draw: Mapping[str, Tensor], ranges: Mapping[str, Range], crops: Iterable[str], owner: str) -> Draw:
+def checked_draw(
+    draw: Mapping[str, Tensor], ranges: Mapping[str, Range], crops: Iterable[str], labels: Iterable[str], owner: str
+) -> Draw:
     """Return a draw that was given as arrays, or as tensors if numbers may not be read.
 
-    crops: further names, of a box (4,) for each sample.
+    Args:
+        draw: what was given.
+        ranges: what it must hold, by name.
+        crops: further names that it must hold, of a box (4,) for each sample.
+        labels: names of labels that it may hold, which stay as they are.
+        owner: the augmentation's name, for errors.
     """
     sizes: dict[str, int | None] = {name: interval.size for name, interval in ranges.items()}
     sizes |= dict.fromkeys(crops, 4)
-    as_mapping(draw, "draw", owner, "what draw() returns")
+    draw = as_mapping(draw, "draw", owner, "what draw() returns")
     if missing := [name for name in ("apply", *sizes) if name not in draw]:
         has = ", ".join(map(str, draw)) or "nothing"
         raise ValueError(f"{owner}: draw must have {', '.join(missing)}; got {has}")
-    values: dict[str, Any] = {name: torch.as_tensor(draw[name]) for name in ("apply", *sizes)}
+    values: dict[str, Any] = {name: _as_tensor(draw[name], name, owner) for name in ("apply", *sizes)}
     if values["apply"].ndim != 1:
         raise ValueError(f"{owner}: draw['apply'] must be (B,), which of B samples move; got {shown(draw['apply'])}")
     values["apply"] = values["apply"] > 0.5
@@ -223,9 +230,16 @@ def checked_draw(draw: Mapping[str, Tensor], ranges: Mapping[str, Range], crops:
         is_positive = name in ranges and name.rpartition(".")[2] in POSITIVE and ranges[name].low > 0
         if is_positive and known_false(value > 0):
             raise ValueError(f"{owner}: draw[{name!r}] must be positive; got {value.double().tolist()}")
-    if not are_numbers(*values.values()):
-        return values
-    return {name: (value if name == "apply" else value.double()).numpy() for name, value in values.items()}
+    if are_numbers(*values.values()):
+        values = {name: (value if name == "apply" else value.double()).numpy() for name, value in values.items()}
+    return values | {name: draw[name] for name in labels if name in draw}
+
+
+def _as_tensor(value: Any, name: str, owner: str) -> Tensor:
+    try:
+        return torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"{owner}: draw[{name!r}] must be numbers; got {shown(value)}") from None
 
 
 def chosen_boxes(crops: Mapping[str, int], boxes: Iterable[Tensor] | None, owner: str) -> dict[str, Tensor]:

@@ -1,6 +1,5 @@
 """A random rolling shutter in front of the camera of a sample."""
 
-from collections.abc import Sequence
 from typing import ClassVar, Unpack
 
 import torch
@@ -33,6 +32,7 @@ class RandomShutter(Augmentation):
     """
 
     keeps_lens: ClassVar[bool] = True
+    goes_last: ClassVar[bool] = True
 
     def __init__(
         self, readout: RangeLike, rates: RangeLike, *, direction: Direction = "down", **options: Unpack[EditOptions]
@@ -45,9 +45,6 @@ class RandomShutter(Augmentation):
         }
         super().__init__(ranges, min_filled=0, **options)  # only the rim may be empty
         self.direction: Direction = one_of(direction, DIRECTIONS, "direction", name)
-
-    def _chain_error(self, later: Sequence[Augmentation], name: str) -> str | None:
-        return f"move no rows of a rolling shutter: {name} goes last" if later else None
 
     def _part(self, source: Camera, draw: Draw) -> Part:
         values = as_tensors(source, values_for(source, draw))

@@ -409,6 +409,21 @@ def test_a_part_of_a_chain_may_be_the_same_on_a_batch():
     assert len(set(draw["1.focal"].tolist())) == 4
 
 
+@pytest.mark.parametrize("first", [RandomMount, A.VerticalFlip])
+@pytest.mark.parametrize("second", [RandomMount, A.VerticalFlip, lambda **given: RandomLens("dms130", **given)])
+@pytest.mark.parametrize("batched", [False, True])
+def test_changes_in_turn_keep_the_options_of_the_second(first, second, batched):
+    camera = pinhole(SIZE, 250.0)
+    options = {"mode": "nearest", "fill": 0.5, "tolerance": 0.0}
+    one, other = first(camera=camera, p=1.0), second(camera=camera, p=1.0, **options)
+    count = 3 if batched else 1
+    before = one.change(camera, one.draw(count))
+    after = other.change(before.target, other.draw(count))
+    (part,) = before.then(after).parts
+    assert part.warp.options == after.parts[0].warp.options
+    assert (part.warp.options["mode"], part.warp.options["fill"]) == ("nearest", (0.5,))
+
+
 @pytest.mark.parametrize("shape", [(3,), (2, 3), (2, 4, 3)])
 def test_inverse_takes_the_new_camera_as_a_keyword(shape):
     camera, augment = ct.Pinhole.from_fov(70, image_size=(24, 32)), A.RandomMount(zoom=(2, 3))

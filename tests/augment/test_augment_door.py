@@ -98,6 +98,9 @@ def test_cameras_and_draws(camera):
         ),
         (lambda: mount(given, draw=some), "draw must have yaw, pitch, roll, zoom; got apply"),
         (lambda: mount(given, draw={**draw, "yaw": draw["yaw"][:, None]}), r"\['yaw'\] must be \(2,\); .* \(2, 1\)"),
+        (lambda: mount(given, draw={**draw, "yaw": ["a", "b"]}), r"draw\['yaw'\] must be numbers; got \['a', 'b'\]"),
+        (lambda: mount.change([camera] * 3, draw), "draw must be for 3 samples, as the cameras; got one for 2"),
+        (lambda: mount.change(camera, None), "draw must have apply, yaw, pitch, roll, zoom; got nothing"),
         (lambda: RandomMount().inverse(given), "must have a change to invert; got none. Call it first"),
         (lambda: zooming.inverse(samples[0]), r"must be those that this change made; got Pinhole\(.*another call"),
         (lambda: mount.inverse(turned[0]), r"camera and rotation of the sample must be those that this change made"),
@@ -262,6 +265,7 @@ def test_what_is_set_later_is_checked_as_by_the_constructor(camera):
         ("p", 7, r"RandomMount: p must be a probability in \[0, 1\]; got 7"),
         ("p", "half", "RandomMount: p must be a number"),
         ("min_filled", -3, r"RandomMount: min_filled must be a part in \[0, 1\]; got -3"),
+        ("same_on_batch", 3, "RandomMount: same_on_batch must be"),
     ):
         with pytest.raises((TypeError, ValueError), match=text):
             setattr(mount, name, value)
