@@ -461,6 +461,24 @@ def test_what_never_applies_leaves_the_size():
     assert tuple(always._params["output_size"][0]) == out.shape[-2:] == (40, 53)
 
 
+class Halved(augment.Augmentation):
+    """An augmentation of one's own, which says only by `size_after` how large new images are."""
+
+    def new_camera(self, source, values):
+        return source.resize(*self.size_after(source.image_size)), None
+
+    def size_after(self, size):
+        return size[0] // 2, size[1] // 2
+
+
+def test_the_size_of_ones_own_augmentation_reaches_the_next_child():
+    parts = adapter.CameraAugmentation(Halved(), camera()), K.RandomHorizontalFlip(p=1.0), K.RandomCrop((40, 40), p=1.0)
+    seq = K.AugmentationSequential(*parts, data_keys=["input"])
+    assert seq(images()).shape[-2:] == (40, 40)
+    assert seq._params[0].data["output_size"].tolist() == [[48, 64]] * 3
+    assert seq._params[1].data["forward_input_shape"].tolist() == [3, 1, 48, 64]
+
+
 def test_labels_follow_a_lens_in_the_container_in_which_theirs_stay_behind():
     """kornia#4420: its fisheye and its elastic map move images, and no keypoints and boxes."""
     spot = torch.zeros(1, 1, *SIZE)

@@ -120,7 +120,12 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     def _set_size(self, own_size: tuple[int, int]) -> None:
         """Tell kornia the size of new images of a size."""
         self.flags.pop("size", None)
-        size = self.augmentation._size_if_applied(own_size) if self.p else own_size
+        if not self.p:
+            size = own_size
+        elif self.augmentation.p:
+            size = self.augmentation.size_after(own_size)
+        else:  # the p given to kornia applies what never applies by itself
+            size = self.augmentation._size_if_applied(own_size)
         if size != own_size:
             self.flags["size"] = size
 
