@@ -106,10 +106,12 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
             keepdim=keepdim,
         )
         self.augmentation, self.camera = augmentation, camera
-        options = augmentation.options
         kind_of_camera(self.camera_for((1, 1)))  # which torch.compile looks up
-        self.flags: dict[str, Any] = {"resample": Resample.get(options["mode"]), "align_corners": False}
-        self.flags["padding_mode"] = SamplePadding.get(options["padding_mode"])
+        self.flags: dict[str, Any] = {
+            "resample": Resample.get(augmentation.options["mode"]),
+            "align_corners": False,
+            "padding_mode": SamplePadding.get(augmentation.options["padding_mode"]),
+        }
         if isinstance(camera, Camera):
             self._set_size(check_single(name, camera, (), ". with_cameras gives every sample its own"))
         self.keypoints_valid: Tensor | None = None
@@ -155,27 +157,35 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     def change(self, params: Params | None = None, device: torch.device | None = None) -> Change:
         """Return the change by params, by default the last: `source`, `target`, `rotation`, `points(...)` and so on."""
         params = self._params if params is None else params
-        ours = *self.augmentation.ranges, *self.augmentation.crops
-        if missing := [name for name in ("batch_prob", *ours) if name not in params]:
+        draw, camera, augmentation = self._draw_of(params), self._camera_of(params, device), self.augmentation
+        inputs = [*draw.values(), camera.intrinsics, camera.distortion]
+        inputs += [*augmentation.parameters(), *augmentation.buffers()]
+        key = type(camera), camera.image_size, _state_key(augmentation)
+        of_row, of_batch = self._memos
+        memo = of_row if len(draw["apply"]) == 1 else of_batch
+        return memo.unless_learning(inputs, key, lambda: augmentation.change(camera, draw))
+
+    def _draw_of(self, params: Params) -> dict[str, Tensor]:
+        """Return the draw that params hold, as `Augmentation.draw` returns one."""
+        name, crops = type(self).__name__, self.augmentation.crops
+        ours = *self.augmentation.ranges, *crops
+        if missing := [key for key in ("batch_prob", *ours) if key not in params]:
             need, has = ", ".join(missing), ", ".join(params) or "none"
-            raise ValueError(f"{type(self).__name__}: params must have {need}; got {has}. Call it first")
-        values = {"apply": self._gate(params), **{name: params[name] for name in ours}}
-        if self.augmentation.crops and any(known_some(values[name].isnan()) for name in self.augmentation.crops):
+            raise ValueError(f"{name}: params must have {need}; got {has}. Call it first")
+        if any(known_some(params[key].isnan()) for key in crops):
             raise ValueError(
-                f"{type(self).__name__}: params must hold boxes, as kornia passes boxes after images; got none. Use "
+                f"{name}: params must hold boxes, as kornia passes boxes after images; got none. Use "
                 "params = aug.forward_parameters(images.shape), then aug(images, params=with_boxes(params, boxes))"
             )
+        return {"apply": self._gate(params), **{key: params[key] for key in ours}}
+
+    def _camera_of(self, params: Params, device: torch.device | None) -> Camera:
+        """Return the cameras of the images of params, on a device; None: on that of the known camera."""
         camera = self.camera
         if isinstance(camera, Guess):
-            size = (params[KIND][0] if len(params[KIND]) else params["forward_input_shape"])[-2:]
-            camera = self.camera_for(size.tolist())
-        camera = camera_with_params(params, camera, device)
-        inputs = [*values.values(), camera.intrinsics, camera.distortion]
-        inputs += [*self.augmentation.parameters(), *self.augmentation.buffers()]
-        key = type(camera), camera.image_size, _state_key(self.augmentation)
-        of_row, of_batch = self._memos
-        memo = of_row if len(values["apply"]) == 1 else of_batch
-        return memo.unless_learning(inputs, key, lambda: self.augmentation.change(camera, values))
+            shape = params[KIND][0] if len(params[KIND]) else params["forward_input_shape"]
+            camera = self.camera_for(shape[-2:].tolist())
+        return camera_with_params(params, camera, device)
 
     @property
     def last(self) -> Change | None:
@@ -208,8 +218,10 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
         return result, valid.reshape(input.shape[: 2 - dims])
 
     def apply_transform(self, input: Tensor, params: Params, flags: Flags, transform: Any = None) -> Tensor:
-        options: Any = {"mode": Resample.get(flags["resample"]).name.lower()}
-        options["padding_mode"] = SamplePadding.get(flags["padding_mode"]).name.lower()
+        options: Any = {
+            "mode": Resample.get(flags["resample"]).name.lower(),
+            "padding_mode": SamplePadding.get(flags["padding_mode"]).name.lower(),
+        }
         return self._move(input, params, flags, lambda change, images: change.images(images, **options))[0]
 
     def apply_transform_mask(self, input: Tensor, params: Params, flags: Flags, transform: Any = None) -> Tensor:
@@ -298,15 +310,16 @@ class _Random(CameraAugmentation):
 
     def __init__(self, *given: Any, camera: Camera | float | None = None, **options: Any):
         name = type(self).__name__
-        first, others = (given[0], given[1:]) if camera is None and given else (camera, given)
-        guess = first is camera and isinstance(first, (int, float)) and not isinstance(first, bool)
-        if not isinstance(first, Camera) and not guess:
-            preset, got = (f", {first!r}", repr(first)) if isinstance(first, str) else ("", type(first).__name__)
+        is_guess = isinstance(camera, (int, float)) and not isinstance(camera, bool)  # by its name alone
+        if camera is None and given:
+            camera, given = given[0], given[1:]
+        if not isinstance(camera, Camera) and not is_guess:
+            preset, got = (f", {camera!r}", repr(camera)) if isinstance(camera, str) else ("", type(camera).__name__)
             raise TypeError(
                 f"{name}: camera must be the Camera of the images and comes first: {name}(camera{preset}); got {got}"
             )
         of_kornia = {key: options.pop(key) for key in ("p", "p_batch", "same_on_batch", "keepdim") if key in options}
-        super().__init__(self._wraps(*others, **options), first, **of_kornia)
+        super().__init__(self._wraps(*given, **options), camera, **of_kornia)
 
 
 def _named(wraps: type[Augmentation]) -> type[_Random]:
