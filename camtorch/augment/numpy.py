@@ -9,7 +9,7 @@ The module is imported by name: `import camtorch.augment.numpy`.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,7 +35,6 @@ class Way(NamedTuple):
 
     read: Callable[[Any], Sample]  # value -> tensors by name
     write: Callable[[Sample, Any], Any]  # (moved sample, value as given) -> value
-    names: Set[str]  # of the tensors
 
 
 class Transform(FrontEnd):
@@ -126,9 +125,10 @@ class Transform(FrontEnd):
             tensors.update(way.read(sample[name]))
 
         def write(moved: Sample) -> Sample:
+            lost = tensors.keys() - moved.keys()  # a face is moved back without its rotation
             result = {}
             for name, way in ways.items():
-                if moved.keys() >= way.names:  # a face is moved back without its rotation
+                if name not in lost:
                     result[name] = way.write(moved, sample[name])
             for name, value in moved.items():
                 if tensors.get(name) is None or name == PLACE:
@@ -174,13 +174,13 @@ class Transform(FrontEnd):
 
 
 def _way_of_others(name: str) -> Way:
-    return Way(lambda given: {name: given}, lambda moved, given: moved[name], {name})
+    return Way(lambda given: {name: given}, lambda moved, given: moved[name])
 
 
 def _way_of_numbers(name: str, value: Any, kind: str | None) -> Way:
     """Return the way of labels, of flags, and of orders of landmarks, whose kind is None."""
     if kind is not None and _is_shared(name, value) and value.dtype.kind == "f":
-        return Way(lambda given: {name: torch.from_numpy(given)}, lambda moved, given: moved[name].numpy(), {name})
+        return Way(lambda given: {name: torch.from_numpy(given)}, lambda moved, given: moved[name].numpy())
 
     def read(given: Any) -> Sample:
         return {name: as_tensor(_numbers(given, name, kind), name, _OWNER)}
@@ -188,7 +188,7 @@ def _way_of_numbers(name: str, value: Any, kind: str | None) -> Way:
     def write(moved: Sample, given: Any) -> Any:
         return plain(moved[name]).astype(_numbers(given, name, kind).dtype, copy=False)
 
-    return Way(read, write, {name})
+    return Way(read, write)
 
 
 def _way_of_image(name: str, value: Any, size: tuple[int, int] | None) -> Way:
@@ -203,12 +203,10 @@ def _way_of_image(name: str, value: Any, size: tuple[int, int] | None) -> Way:
 
     read(value)  # raises if it is none
     if not _is_shared(name, value):
-        return Way(read, write, {name})
+        return Way(read, write)
     if value.ndim == 2:
-        return Way(
-            lambda given: {name: torch.from_numpy(given)[None]}, lambda moved, given: moved[name].numpy()[0], {name}
-        )
-    return Way(lambda given: {name: torch.from_numpy(given).permute(2, 0, 1)}, write, {name})
+        return Way(lambda given: {name: torch.from_numpy(given)[None]}, lambda moved, given: moved[name].numpy()[0])
+    return Way(lambda given: {name: torch.from_numpy(given).permute(2, 0, 1)}, write)
 
 
 def _way_of_images(name: str, value: Any, size: tuple[int, int] | None, kind: str | None) -> Way:
@@ -218,7 +216,6 @@ def _way_of_images(name: str, value: Any, size: tuple[int, int] | None, kind: st
         return Way(
             lambda given: {key: torch.from_numpy(given.reshape(given.shape[:3]))},
             lambda moved, given: np.empty((*moved[key].shape, *given.shape[3:]), given.dtype),
-            {key},
         )
 
     def read(given: Any) -> Sample:
@@ -228,7 +225,7 @@ def _way_of_images(name: str, value: Any, size: tuple[int, int] | None, kind: st
         images = [as_array(moved[f"{key}[{i}]"], one) for i, one in enumerate(given)]
         return images if is_list else np.stack(images)
 
-    return Way(read, write, {f"{key}[{i}]" for i in range(len(value))})
+    return Way(read, write)
 
 
 def _is_shared(name: str, value: Any) -> bool:
