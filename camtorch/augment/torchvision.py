@@ -121,16 +121,15 @@ class Transform(FrontEnd, v2.Transform):
         for name, count in (("camera", len(cameras)), (PLACE, nest.names.count(PLACE))):
             if count > 1:
                 raise ValueError(f"{_OWNER}: a sample must have one {name}; got {count}")
-        given_camera = leaves[cameras[0]] if cameras else self.camera
+        known = leaves[cameras[0]] if cameras else self.camera
         sizes = []
         for i, field in fields.items():
             size = field.value.shape[-2:] if field.kind in IMAGES else getattr(leaves[i], "canvas_size", None)
             if size is not None:
                 sizes.append((type(leaves[i]).__name__, tuple(size)))
         matrix = next(((keys[i], field.value) for i, field in fields.items() if field.kind == "K"), None)
-        camera = camera_of_sample(_OWNER, given_camera, augmentation.camera, augmentation.needs_camera, sizes, matrix)
-        is_guessed = matrix is None and isinstance(known_camera(given_camera, augmentation.camera), Guess)
-        kinds = {keys[i]: field.kind or KEEP for i, field in fields.items()}
+        camera = camera_of_sample(_OWNER, known, augmentation.camera, augmentation.needs_camera, sizes, matrix)
+        is_guessed = matrix is None and isinstance(known_camera(known, augmentation.camera), Guess)
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
         sample = Frames({keys[i]: field.value for i, field in fields.items()}, camera=detached(camera))
         added = [name for name in (PLACE, "rotation") if augmentation.place and name not in sample]
@@ -147,15 +146,12 @@ class Transform(FrontEnd, v2.Transform):
             result = pytree.tree_unflatten(leaves, nest.spec)
             if isinstance(result, dict):
                 result |= {name: moved[name] for name in added}
-            for i in fields if self.valid else ():
-                path, valid = nest.paths[i], moved.get(f"{keys[i]}_valid")
-                if valid is not None and path and isinstance(path[-1], pytree.MappingKey):
-                    holder = functools.reduce(lambda held, step: step.get(held), path[:-1], result)
-                    flags = valid if isinstance(leaves[i], Tensor) else valid.numpy()
-                    holder.setdefault(f"{nest.names[i]}_valid", flags)
+            if self.valid:
+                for i in fields:
+                    nest.put_flags(i, moved.get(f"{keys[i]}_valid"), result)
             return result
 
-        return sample, kinds, write
+        return sample, {keys[i]: field.kind or KEEP for i, field in fields.items()}, write
 
     def _kinds(self, nest: _Nest) -> dict[int, str | None]:
         """Return the kind of each leaf that moves, and None for those that may be flags or orders of landmarks."""
@@ -170,11 +166,11 @@ class Transform(FrontEnd, v2.Transform):
                 except ValueError as error:
                     kinds[i], problems[i] = None, error
         if "image" not in kinds.values():
-            unknown = (i for i, kind in kinds.items() if kind is None)
-            first = next((i for i in unknown if _may_be_image(nest.names[i], nest.leaves[i], fields)), None)
-            if first is not None:
-                kinds[first] = "image"
-                problems.pop(first, None)
+            for i, kind in kinds.items():
+                if kind is None and _may_be_image(nest.names[i], nest.leaves[i], fields):
+                    kinds[i] = "image"
+                    problems.pop(i, None)
+                    break
         for problem in problems.values():
             raise problem
         return {i: kind for i, kind in kinds.items() if kind or isinstance(nest.leaves[i], _HELD)}
@@ -189,6 +185,14 @@ class _Nest:
         self.leaves = [leaf for _, leaf in flat]
         self.names = [_name(path) for path in self.paths]
         self.keys = _keys(self.paths, self.names)  # the names, made distinct
+
+    def put_flags(self, i: int, valid: Tensor | None, nest: Any) -> None:
+        """Put the flags of leaf `i` beside it into a nest, if a dict holds it and has none."""
+        path = self.paths[i]
+        if valid is not None and path and isinstance(path[-1], pytree.MappingKey):
+            holder = functools.reduce(lambda held, step: step.get(held), path[:-1], nest)
+            flags = valid if isinstance(self.leaves[i], Tensor) else valid.numpy()
+            holder.setdefault(f"{self.names[i]}_valid", flags)
 
 
 def _name(path: Any) -> str:

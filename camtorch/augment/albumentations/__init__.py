@@ -111,17 +111,18 @@ class Transform(FrontEnd, A.DualTransform):
         fields = {} if isinstance(camera, Unknown) else {"camera": camera}
         targets = {}  # field -> its name in the sample, and the target of that name
         for i, (name, value) in enumerate(data.items()):
-            target = self._additional_targets.get(name, name)
-            stays = value is None or name in ("camera", "applied_transforms", self.save_key)
-            if stays or (target in _MAY_BE_EMPTY and len(value) == 0):
+            target, field = self._additional_targets.get(name, name), name
+            if value is None or name in ("camera", "applied_transforms", self.save_key):
                 continue
-            field = name
+            if target in _MAY_BE_EMPTY and len(value) == 0:
+                continue
             if name != target:
                 kind = kind_of(target, value, self.augmentation.fields, _OWNER, single=True)
                 if kind is None:
                     continue
                 field = f"{kind}_{i}"  # a name that begins with a kind is known
-            targets[field], fields[field] = (name, target), _given(target, value, camera)
+            targets[field] = name, target
+            fields[field] = _as_field(target, value, camera)
 
         def write(moved: Sample) -> Sample:
             change = present(self.augmentation.last, "the change of the call that moved")
@@ -129,7 +130,7 @@ class Transform(FrontEnd, A.DualTransform):
             result = data | {name: moved[name] for name in followed if name in moved}
             for field, (name, target) in targets.items():
                 seen = moved.get(f"{field}_valid")
-                result[name] = _taken(target, data[name], moved[field], seen, change.parts[0].image_size)
+                result[name] = _as_target(target, data[name], moved[field], seen, change.parts[0].image_size)
                 if seen is not None and target not in _TARGETS:
                     result[f"{name}_valid"] = seen
             return result
@@ -141,11 +142,10 @@ class Transform(FrontEnd, A.DualTransform):
         sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]
         several = [name for name in ("images", "masks") if data.get(name) is not None and len(data[name])]
         sizes += [(name, np.shape(data[name][0])[:2]) for name in several]
-        given = self.camera if data.get("camera") is None else data["camera"]
-        matrices = ((name, value) for name, value in data.items() if value is not None and self._is_matrix(name, value))
-        return camera_of_sample(
-            _OWNER, given, self.augmentation.camera, self.augmentation.needs_camera, sizes, next(matrices, None)
-        )
+        known = self.camera if data.get("camera") is None else data["camera"]
+        matrix = next((pair for pair in data.items() if pair[1] is not None and self._is_matrix(*pair)), None)
+        own = self.augmentation
+        return camera_of_sample(_OWNER, known, own.camera, own.needs_camera, sizes, matrix)
 
     def _is_matrix(self, name: str, value: Any) -> bool:
         name = self._additional_targets.get(name, name)
@@ -153,7 +153,7 @@ class Transform(FrontEnd, A.DualTransform):
         return (name in NAMES or "K" in kinds.values()) and kind_of(name, value, kinds, _OWNER, single=True) == "K"
 
 
-def _given(target: str, value: Any, camera: Camera) -> Any:
+def _as_field(target: str, value: Any, camera: Camera) -> Any:
     """Return a target as `numpy.Transform` takes it: in pixels, and NaN for a keypoint without a place."""
     if target == "bboxes":
         return value[:, :4].astype(np.float64) * ([camera.width, camera.height] * 2) - 0.5
@@ -162,7 +162,7 @@ def _given(target: str, value: Any, camera: Camera) -> Any:
     return list(value) if target in ("images", "masks") else value
 
 
-def _taken(target: str, given: Any, moved: Any, seen: Any, size: tuple[int, int]) -> Any:
+def _as_target(target: str, given: Any, moved: Any, seen: Any, size: tuple[int, int]) -> Any:
     """Return a moved target in the form of pipelines."""
     if target == "keypoints":
         return np.concatenate((np.nan_to_num(moved, nan=-1.0), given[:, 2:]), 1)
