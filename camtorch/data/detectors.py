@@ -91,7 +91,8 @@ def from_ultralytics(results: Any) -> Sample:
         way = "[ct.data.from_ultralytics(one) for one in results] takes each"
         raise ValueError(f"from_ultralytics: results must be of one image; got {len(found)}. {way}")
     boxes = _tensor(found[0].boxes.xyxy).reshape(-1, 4) - 0.5
-    if (keypoints := getattr(found[0], "keypoints", None)) is None:
+    keypoints = getattr(found[0], "keypoints", None)
+    if keypoints is None:
         return {"boxes": boxes}
     sample: Sample = {"keypoints": _tensor(keypoints.xy)[: len(boxes)] - 0.5, "boxes": boxes}
     if getattr(keypoints, "conf", None) is not None:

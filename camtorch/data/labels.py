@@ -60,7 +60,8 @@ class Samples(Dataset[Sample]):
 
     def __getitem__(self, index: int) -> Sample:
         sample = self._sample(self, self._entries[operator.index(index)])
-        if path := sample.get("path"):
+        path = sample.get("path")
+        if path:
             sample |= {"image": _image_at(path), "path": str(path)}
         return sample
 
@@ -92,7 +93,8 @@ def _coco_sample(samples: Samples, entry: tuple[int, Json | None, Json]) -> Samp
     if image is None:
         raise ValueError(f"{place}: image_id must be that of an image; got {one.get('image_id')!r:.60}")
     with _failing_at(place, "not as COCO has it: ", *_UNLIKE):
-        stem, year = samples.path.stem, samples.path.stem.rpartition("_")[2]  # of person_keypoints_train2017
+        stem = samples.path.stem  # such as person_keypoints_train2017
+        year = stem.rpartition("_")[2]
         path = _find(samples, place, image["file_name"], ("images", stem, year, f"images/{year}"))
         fields = [name for name in KINDS if name != "keypoints" and one.get(name)]
         sample: Sample = {name: _numbers(one[name], place, name) for name in fields}
@@ -115,7 +117,8 @@ def _wflw(path: Path) -> Opened:
 
 def _wflw_sample(samples: Samples, entry: tuple[str, bytes]) -> Sample:
     place = f"{samples.path}, {entry[0]}"
-    if len(words := _text(entry[1], place).strip().split(maxsplit=206)) not in (197, 207):
+    words = _text(entry[1], place).strip().split(maxsplit=206)
+    if len(words) not in (197, 207):
         what = "must be 207 words, 98 points, a box, six attributes and the name of an image"
         raise ValueError(f"{place}: {what}, or 197 without box and attributes; got {len(words)}")
     sample: Sample = {"keypoints": _numbers(words[:196], place, "points", 98, 2)}
@@ -150,18 +153,20 @@ def _pts_sample(samples: Samples, path: Path) -> Sample:
 
 def _mat_sample(samples: Samples, path: Path) -> Sample:
     arrays = _matlab(path)
-    points = [array[:2].T for name in ("pt2d", "pt3d_68") if (array := arrays.get(name, _NONE)).shape[1:] == (68,)]
-    pose, shapes = arrays.get("Pose_Para", _NONE).ravel(), {name: array.shape for name, array in arrays.items()}
+    shapes = {name: array.shape for name, array in arrays.items()}
+    points = [arrays[name][:2].T for name in ("pt2d", "pt3d_68") if shapes.get(name, ())[1:] == (68,)]
+    pose = arrays.get("Pose_Para", np.zeros(0)).ravel()
     if not points or pose.size != 7:
         raise ValueError(f"{path}: must hold pt2d (2, 68) or pt3d_68 (3, 68), and Pose_Para (1, 7); got {shapes}")
     # 3DDFA's matrix is Rx(-pitch) Ry(-yaw) Rz(-roll) in its own frame, y up and z out of the image
-    (pitch, yaw, roll), (x, y, z), head = _numbers(pose[:3], path, "Pose_Para"), torch.eye(3), torch.eye(4)
+    pitch, yaw, roll = _numbers(pose[:3], path, "Pose_Para")
+    x, y, z = torch.eye(3)
+    head = torch.eye(4)
     head[:3, :3] = rotation_matrix(-pitch * x) @ rotation_matrix(yaw * y) @ rotation_matrix(roll * z)
     keypoints = _numbers(points[0], path, "points", 68, 2) - 1
     return {"keypoints": keypoints, "head_pose": head, "path": _find(samples, path, path.stem, (), _SUFFIXES)}
 
 
-_NONE = np.zeros(0)
 _MATRIX, _COMPRESSED, _LARGEST_FILE = 14, 15, 1 << 26  # bytes of a file; those of 300W-LP have some thousands
 _TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8", 13: "<u8"}
 
@@ -208,10 +213,10 @@ def _vcd(path: Path) -> Opened:
         cameras = {name: one for name, one in root.get("streams", {}).items() if one.get("type", "camera") == "camera"}
         properties = {name: one.get("stream_properties", {}) for name, one in cameras.items()}
         shifts = {name: one.get("sync", {}).get("frame_shift", 0) for name, one in properties.items()} or {"": 0}
-        first, frames = min(0, *shifts.values(), 0), sorted(root["frames"], key=int)
+        first = min(0, *shifts.values())
         return [
             (root, frame, name, cameras.get(name, {}).get("uri"), int(frame) - shift + first, properties.get(name, {}))
-            for frame in frames
+            for frame in sorted(root["frames"], key=int)
             for name, shift in shifts.items()
         ], None
 
@@ -225,7 +230,8 @@ def _vcd_sample(samples: Samples, entry: tuple[Json, str, str, str | None, int, 
             away = Path(uri).anchor or ".." in Path(uri).parts
             path = _find(samples, place, Path(uri).name, ("" if away else str(Path(uri).parent),))
             image = _image_at(path) if path.suffix.lower() in _SUFFIXES else _video_frame(path, at)
-            sample |= {} if image is None else {"image": image}
+            if image is not None:
+                sample["image"] = image
         kinds = ("bbox", 4, "boxes", "box_names"), ("point2d", 2, "keypoints", "point_names")
         for kind, count, field, names in kinds:
             items = [
@@ -240,7 +246,8 @@ def _vcd_sample(samples: Samples, entry: tuple[Json, str, str, str | None, int, 
         middle, size = sample["boxes"].split(2, 1)
         sample["boxes"] = torch.cat((middle - size / 2, middle + size / 2), 1)
         sample["actions"] = [root["actions"][uid]["type"] for uid in content.get("actions", {})]
-    if (pinhole := properties.get("intrinsics_pinhole")) is not None:
+    pinhole = properties.get("intrinsics_pinhole")
+    if pinhole is not None:
         with _failing_at(f"{samples.path}, streams.{stream}.intrinsics_pinhole", "", ValueError, *_UNLIKE):
             sample["camera"] = _pinhole(**pinhole)
     return sample
@@ -283,7 +290,8 @@ def _find(
     for root in [samples.images] if samples.images else roots:
         for folder in ("", *folders):
             for suffix in suffixes:
-                if os.path.isfile(file := f"{root / folder / parts}{suffix}"):  # False, too, for impossible names
+                file = f"{root / folder / parts}{suffix}"
+                if os.path.isfile(file):  # False, too, for impossible names
                     return Path(file)
     where = f" or in {', '.join(map(repr, folders))} there or up to {_UP} folders above" if folders else ""
     ends = f" with one of {' '.join(suffixes[:4])}" if len(suffixes) > 1 else ""

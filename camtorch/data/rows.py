@@ -72,7 +72,8 @@ class Mover:
         try:
             moving = {name: value for name, value in row.items() if self._moves(name, value)}
             fields = {name: _dense(name, value, self._kind(name, value)) for name, value in moving.items()}
-            if (camera := row.get("camera")) is not None:
+            camera = row.get("camera")
+            if camera is not None:
                 fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)
             if self._seeded is None:
                 return self._fixed(fields)
@@ -162,9 +163,10 @@ class MapBatches(Mover):
         fields: Mapping[str, str] | None = None,
     ):
         super().__init__(transform, seed, epoch, fields)
-        self._keys = [key] if isinstance(key, str) else list(key) if is_list(key) else []
-        if not (key is None or isinstance(key, str) or is_list(key)) or not all(isinstance(k, str) for k in self._keys):
+        keys = () if key is None else (key,) if isinstance(key, str) else key
+        if not is_list(keys) or not all(isinstance(name, str) for name in keys):
             raise TypeError(f"{self._owner}: key must be the name of a column, or several in a list; got {shown(key)}")
+        self._keys = list(keys)
         if self._seeded is not None and not self._keys:
             raise ValueError(
                 f'{self._owner}: key must name the column that identifies a row, as in key="path" after '
@@ -201,7 +203,9 @@ class MapBatches(Mover):
     def _row(self, row: dict[str, Any]) -> Sample:
         values = [row.pop(name) for name in self._keys]
         values = [value.item() if isinstance(value, np.generic) else value for value in values]
-        key: Key | None = tuple(values) if len(values) > 1 else values[0] if values else None
+        key: Key | None = tuple(values) if values else None
+        if len(values) == 1:
+            key = values[0]
         row["camera"] = {part: row.pop(f"camera_{part}") for part in PARTS if f"camera_{part}" in row} or None
         moved = dict(self._moved(key, row))
         camera = moved.pop("camera", None)
@@ -276,14 +280,16 @@ class MapSamples(Mover):
             raise TypeError(f"{owner}: a sample must be a dict of entries, before .to_tuple; got {kind}")
         if self._seeded is not None and self._key not in sample:
             raise ValueError(f"{owner}: a sample must have {self._key!r}; got {', '.join(map(str, sample))}")
-        if not isinstance(labels := sample.get(self._labels, {}), Mapping):
+        labels = sample.get(self._labels, {})
+        if not isinstance(labels, Mapping):
             raise TypeError(
                 f"{owner}: {self._labels} must be an object of labels; got {type(labels).__name__}"
                 + (". Add .decode() before .map" if isinstance(labels, bytes) else "")
             )
         entry_of: dict[str, str] = {}
         for entry, value in sample.items():
-            if (field := self._field(entry, value)) is not None:
+            field = self._field(entry, value)
+            if field is not None:
                 if field in entry_of or field in labels:
                     raise ValueError(f"{owner}: {entry} and {entry_of.get(field, self._labels)} both hold {field}")
                 entry_of[field] = entry
@@ -303,19 +309,23 @@ class MapSamples(Mover):
 
     def _field(self, entry: str, value: Any) -> str | None:
         """Return the field that an entry holds, or None if it is passed on."""
-        owner, (stem, _, ending) = self._owner, entry.rpartition(".")
-        if entry in self._fields or entry.startswith("__") or entry in (self._key, self._labels):
-            return entry if entry in self._fields else None
-        name = stem if ending in _ENDINGS else entry
-        if not stem and ending in _ENDINGS and ending != "npy":
+        owner = self._owner
+        if entry in self._fields:
+            return entry
+        if entry.startswith("__") or entry in (self._key, self._labels):
+            return None
+        stem, _, ending = entry.rpartition(".")
+        has_ending = ending in _ENDINGS
+        name = stem if has_ending else entry
+        if has_ending and not stem and ending != "npy":
             name = "image"
-        if ending in _ENDINGS and isinstance(value, (bytes, bytearray)):
+        if has_ending and isinstance(value, (bytes, bytearray)):
             raise ValueError(f'{owner}: {entry} must be decoded; got bytes. Add .decode("rgb8") before .map')
         if self._moves(name or entry, value):
             if not isinstance(value, np.ndarray):
                 raise TypeError(f"{owner}: {entry} must be a numpy array; got {type(value).__name__}")
             return name
-        if ending in _ENDINGS and np.ndim(value) >= 2 and name not in self._fields:
+        if has_ending and np.ndim(value) >= 2 and name not in self._fields:
             raise ValueError(
                 f"{owner}: {entry} must have a kind; got none. Pass fields={{{entry!r}: KIND}}, with KIND one of "
                 f"{', '.join(IMAGES)} or {KEEP}, among others"

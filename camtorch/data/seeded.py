@@ -35,7 +35,8 @@ def generator(key: Key, *, seed: int = 0, epoch: int = 0) -> torch.Generator:
 
 
 def _number(value: int, name: str) -> int:
-    if not 0 <= (whole := as_whole(value, name, "generator")) < 1 << 63:
+    whole = as_whole(value, name, "generator")
+    if not 0 <= whole < 1 << 63:
         raise ValueError(f"generator: {name} must be 0 or more, and below 2 to the 63rd; got {value}")
     return whole
 

@@ -71,7 +71,8 @@ class CanonicalCamera(SampleTransform):
         **options: Any,
     ):
         super().__init__(antialias=antialias, **options)
-        if not 0 < (focal := as_number(focal, "focal", self._name)) < math.inf:
+        focal = as_number(focal, "focal", self._name)
+        if not 0 < focal < math.inf:
             raise ValueError(f"{self._name}: focal must be positive pixels; got {focal!r}")
         if not isinstance(scales, str) or scales not in ("depth", "image"):
             raise ValueError(f'{self._name}: scales must be "depth" or "image"; got {shown(scales)}')
@@ -106,8 +107,8 @@ class CanonicalCamera(SampleTransform):
             moved = self._scale_sample(sample, batch, scale)
         else:
             moved = self._resize_sample(sample, batch, self._change(camera, count))
-            own = camera.clone()
-            moved["source_camera"] = list(own) if isinstance(sample.get("camera"), (list, tuple)) else own
+            source = camera.clone()
+            moved["source_camera"] = list(source) if isinstance(sample.get("camera"), (list, tuple)) else source
         moved["scale"] = scale if batch.plan.batched else scale.squeeze(0)
         return moved
 
@@ -125,7 +126,8 @@ class CanonicalCamera(SampleTransform):
         if self.scales == "depth":
             batch = self._batch(sample, predicted=True)
             return self._scale_sample(sample, batch, 1 / self.scale(batch.camera).expand(batch.plan.count))
-        if (source := sample.pop("source_camera", None)) is None:
+        source = sample.pop("source_camera", None)
+        if source is None:
             raise ValueError(f"{self._name}: source_camera must be in the sample, as forward() returned it; got none")
         source = source if isinstance(source, Camera) else Mixed(source)
         change = self._change(source, len(source) if source.batch_shape else 1)
@@ -153,13 +155,14 @@ class CanonicalCamera(SampleTransform):
 
     def _lengths(self, found: str, value: Tensor, scale: Tensor, name: str) -> Tensor:
         """Return `value` (*B, ...) of the kind `found`, with all its lengths multiplied by `scale` (*B)."""
-        poses, lengths = found in ("head_pose", "pose"), ("depth", "distance", "points", "tvec")
-        if not poses and found not in lengths and (found != "landmarks" or value.shape[-1] != 3):
+        kind = "points" if found == "landmarks" and value.shape[-1] == 3 else found
+        are_lengths = kind in ("depth", "distance", "points", "tvec")
+        if not are_lengths and kind not in ("head_pose", "pose"):
             return value
         if not value.is_floating_point():
             raise ValueError(f"{self._name}: {name} must be floating point, to be scaled; got {value.dtype}")
         factor = scale.to(value).reshape(*scale.shape, *[1] * (value.ndim - scale.ndim))
-        if not poses:
+        if are_lengths:
             return value * factor
         places = torch.zeros_like(value, dtype=torch.bool)
         places[..., :3, 3] = True
