@@ -48,19 +48,16 @@ class Mover:
     def __init__(self, transform: Moves, seed: int, epoch: int, fields: Mapping[str, str] | None):
         self._owner = owner = type(self).__name__
         self._fields = dict(as_mapping(fields, "fields", owner, "{'lidar': 'points'}"))
-        self._seeded: Seeded | None = None
-        self._fixed: Transform
         if isinstance(transform, (Augmentation, FaceNormalizer)):
-            transform = copy.copy(transform)
-            transform.fields = self._fields = {**transform.fields, **self._fields}
-            if isinstance(transform, FaceNormalizer):
-                self._fixed = Transform(transform)
-            else:
-                self._seeded = Seeded(Transform(transform), seed=seed, epoch=epoch)
+            own: Augmentation | FaceNormalizer = copy.copy(transform)
+            own.fields = self._fields = {**transform.fields, **self._fields}
         elif isinstance(transform, Warp):
-            self._fixed = Transform(Always(transform, owner, self._fields))
+            own = Always(transform, owner, self._fields)
         else:
             raise TypeError(f"{owner}: transform must be an augmentation or a Warp; got {type(transform).__name__}")
+        self._transform = Transform(own)
+        draws = isinstance(transform, Augmentation)
+        self._seeded = Seeded(self._transform, seed=seed, epoch=epoch) if draws else None
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the draws; copies that workers and engines already have are not changed."""
@@ -76,7 +73,7 @@ class Mover:
             if camera is not None:
                 fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)
             if self._seeded is None:
-                return self._fixed(fields)
+                return self._transform(fields)
             return self._seeded(fields, key=key)  # type: ignore[arg-type]
         except (ValueError, TypeError) as error:
             which = "" if key is None else f"sample {key!r:.200}: "

@@ -17,6 +17,7 @@ from camtorch.optics.radial_inverse import precise
 from camtorch.values.arguments import as_coordinates, as_flag, as_image_size, as_number, as_whole
 from camtorch.values.module import GeometryModule, typed_as
 
+_NEVER_FIXED = "fx", "fy", "all"
 _ASPECT = 0.1
 _LARGEST_NUMBER = 1e6  # its square is finite, and its gradient negligible
 _NODES = 33
@@ -85,8 +86,8 @@ class CameraHead(GeometryModule):
         super().__init__()
         owner = type(self).__name__
         features = as_whole(features, "features", owner, least=1)
-        names = () if not isinstance(fixed, Collection) else (fixed,) if isinstance(fixed, str) else tuple(fixed)
-        if any(isinstance(name, str) and name in ("fx", "fy", "all") for name in names):
+        names = (fixed,) if isinstance(fixed, str) else fixed
+        if isinstance(names, Collection) and any(isinstance(name, str) and name in _NEVER_FIXED for name in names):
             raise ValueError(f"{owner}: fixed must not name fx, fy or all; got {fixed!r}. Use fov=(90, 90)")
         asked = asked_model(model, count, None, fixed, owner)
         known = None if asked.start is None else asked.start.image_size
@@ -95,7 +96,8 @@ class CameraHead(GeometryModule):
             raise ValueError(f"{owner}: image_size must be given; got None. Pass image_size=(height, width)")
         if known not in (None, size):
             raise ValueError(f"{owner}: image_size must be that of the camera, {known}; got {size}")
-        centre, shared_focal = as_number(centre, "centre", owner), as_flag(shared_focal, "shared_focal", owner)
+        centre = as_number(centre, "centre", owner)
+        shared_focal = as_flag(shared_focal, "shared_focal", owner)
         if not 0 <= centre < 0.5:
             raise ValueError(f"{owner}: centre must be a part of the image, from 0 to below 0.5; got {centre!r}")
         self.model, self.image_size, self.centre, self.shared_focal = asked.kind, size, centre, shared_focal

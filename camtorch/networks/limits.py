@@ -118,14 +118,14 @@ def _end(margin: Callable[[Tensor], Tensor], like: Tensor) -> tuple[Tensor, Tens
         nearest = torch.where(margin(nearest) > 0, nearest, nearest * (_FIRST / _LAST))
     share = torch.linspace(0, 1, _GRID, dtype=like.dtype, device=like.device)
     parts = torch.arange(1, _PARTS + 1, dtype=like.dtype, device=like.device) / _PARTS
-    times, low, ends = nearest * (_LAST / _FIRST) ** share, torch.zeros_like(nearest), None
-    for _ in range(_ROUNDS):
+    times, low = nearest * (_LAST / _FIRST) ** share, torch.zeros_like(nearest)
+    for i in range(_ROUNDS):
         kept = (margin(times) > 0).long().cumprod(-1).sum(-1, keepdim=True)
-        ends = kept < times.shape[-1] if ends is None else ends
+        if i == 0:
+            ends = kept < times.shape[-1]
         low = torch.where(kept > 0, times.gather(-1, (kept - 1).clamp(min=0)), low)
         high = times.gather(-1, kept.clamp(max=times.shape[-1] - 1))
         times = low + (high - low) * parts
-    assert ends is not None
     before, after = margin(low), margin(high)
     fraction = (before / (before - after)).nan_to_num(nan=0.0).clamp(0, 1)
     return low + (high - low) * torch.where(ends, fraction, 0.0), ends

@@ -60,7 +60,8 @@ def prior_of(
     asked: Model, image_size: tuple[int, int], centre: float, aspect: float, fov: Sequence[float] | None, owner: str
 ) -> Prior:
     """Return the prior of a `CameraHead`; `aspect` is the largest change of the logarithm of fy / fx."""
-    degrees, start, given, ratio = _as_fov(fov, owner), asked.start, None, 0.0
+    degrees, start = _as_fov(fov, owner), asked.start
+    given, ratio = None, 0.0
     middle = [(side - 1) / 2 for side in image_size[::-1]]
     if start is not None:
         fx, fy, *middle = start.intrinsics.detach().double().flatten().tolist()
@@ -85,9 +86,9 @@ def prior_of(
         for longest, focal_length, shortest in ranges:
             if not shortest * (1 - 1e-6) <= focal_length <= longest * (1 + 1e-6):
                 raise ValueError(f"{owner}: fov must contain that of the given camera; got {tuple(fov or ())}")
-            first, second, third = (_disc(plane, far / f) for f in (longest, focal_length, shortest))
-            if first and second and third:
-                found.append(Prior(asked.kind, lens, focal_length, ratio, middle, (first, second, third)))
+            discs = _disc(plane, far / longest), _disc(plane, far / focal_length), _disc(plane, far / shortest)
+            if all(discs):
+                found.append(Prior(asked.kind, lens, focal_length, ratio, middle, discs))
                 break
 
     def rank(prior: Prior) -> tuple[int, float]:

@@ -45,7 +45,7 @@ from camtorch.warp.affine import AffineWarp
 from camtorch.warp.options import Mode
 
 Flags: TypeAlias = dict[str, Any]
-_BACK = "back"  # the flag for moving back
+_BACK = "back"  # the flag of moving back, among those of kornia
 
 
 class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
@@ -191,6 +191,9 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
     def last(self) -> Change | None:
         """The change of the last call."""
         return self.change() if self._params else None
+
+    # The methods that follow are those by which kornia moves each kind of value. Its own move labels, and everything
+    # back, by a matrix, which most moves of lenses are none of; here all move by the change, and back by its inverse.
 
     @on_samples
     def _move(

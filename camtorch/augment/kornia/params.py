@@ -65,7 +65,8 @@ def with_cameras(params: Any, cameras: Camera | Sequence[Camera]) -> Any:
         kinds = one[name]
         if len(kinds) and kinds[0].tolist() != kind:
             raise ValueError(f"with_cameras: cameras must be of the params' model and image_size; got {cameras!r:.200}")
-        count, clips = len(kinds), int(one.get("video_batch_size", len(kinds)))
+        count = len(kinds)
+        clips = int(one.get("video_batch_size", count))
         if batch not in ((), (1,), (count,), (clips,)):
             raise ValueError(f"with_cameras: cameras must be {count}, one for each sample; got batch dims {batch}")
         frames = count // clips if batch == (clips,) and clips else 1
