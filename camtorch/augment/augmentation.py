@@ -89,10 +89,6 @@ class Augmentation(SampleTransform):
     """The names of ranges that change the colours or the light of new images, not their camera."""
     keeps_lens: ClassVar[bool] = False
     """Whether it may come after a lens with chromatic aberration or vignetting in a `Compose`."""
-    goes_last: ClassVar[bool] = False
-    """Whether nothing may come after it in a `Compose`."""
-    needs_depth: bool = False
-    """Whether samples need a depth, so that it is in no `Compose`."""
     _labels_in_draws: ClassVar[Sequence[str]] = ()
     """The names of labels of samples that a draw may hold besides ranges and `crops`."""
     _least_fov: float | None = None
@@ -186,8 +182,7 @@ class Augmentation(SampleTransform):
     # drawn_on_host            edits, lenses and mounts; Compose
     # beside_the_camera        lenses and mounts: colours and light
     # _least_fov                lenses and mounts
-    # keeps_lens, goes_last    RandomShutter
-    # needs_depth              RandomMount
+    # keeps_lens               RandomShutter
     # _labels_in_draws          RandomMount, for the depths of a shift
     # other_words              lenses and mounts
     # _warp_options            Edit, whose warps choose what to antialias

@@ -12,7 +12,9 @@ from camtorch.augment.augmentation import Augmentation, EditOptions
 from camtorch.augment.change import Change, check_sizes
 from camtorch.augment.edits import Edit, change_by
 from camtorch.augment.landmarks import Mirroring
+from camtorch.augment.random_camera import RandomMount
 from camtorch.augment.ranges import Draw, Range, draw_numbers
+from camtorch.augment.shutter import RandomShutter
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.tensors import are_concrete
 from camtorch.values.arguments import as_mapping, present
@@ -191,9 +193,9 @@ def _leaves(part: Augmentation) -> list[Augmentation]:
 
 def _order_error(part: Augmentation, later: Sequence[Augmentation], name: str) -> str | None:
     """Return what parts must do if one, in the part called `name`, cannot precede `later` ones; or None."""
-    if part.goes_last and later:
+    if isinstance(part, RandomShutter) and later:
         return f"move no rows of a rolling shutter: {name} goes last"
-    if part.needs_depth:
+    if isinstance(part, RandomMount) and part.shifts:
         return f"have no shift, which needs depth: {name} goes before"
     colours = part.beside_the_camera.intersection(part.ranges)
     if colours and any(other.needs_camera and not other.keeps_lens for other in later):

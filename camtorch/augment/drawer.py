@@ -177,6 +177,10 @@ class CameraDrawer(Augmentation):
             if may_stay_lazy and self.beside_the_camera.isdisjoint(self.ranges):
                 return Part(source, made)  # of numbers, which become a `Warp` at first use
             target, rotation = made.target, made.rotation
+        return self._seen_by(source, target, rotation, values)
+
+    def _seen_by(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:
+        """Return the part to new cameras, with what values of `beside_the_camera` do to colours and light."""
         beside = as_tensors(source, {name: values[name] for name in self.beside_the_camera.intersection(values)})
         cameras, light = [target], None
         if "chromatic" in beside:  # red and blue are seen by cameras of their own

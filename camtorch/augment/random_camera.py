@@ -140,13 +140,13 @@ class RandomMount(CameraDrawer):
             self.ranges[name] = as_range(each, "shift", self._name)
 
     @property
-    def needs_depth(self) -> bool:  # type: ignore[override]
-        """Whether it shifts."""
+    def shifts(self) -> bool:
+        """Whether it also moves the camera, by `shift`."""
         return _SHIFTS[0] in self.ranges
 
     def _with_labels(self, draw: Draw, rows: Callable[[], Named]) -> Draw:
         draw = super()._with_labels(draw, rows)
-        if not self.needs_depth:
+        if not self.shifts:
             return draw
         named = rows()
         for key, (field, _) in _DEPTHS.items():
@@ -162,7 +162,7 @@ class RandomMount(CameraDrawer):
         )
 
     def _part(self, source: Camera, draw: Draw) -> Part:
-        if not self.needs_depth:
+        if not self.shifts:
             return super()._part(source, draw)
         key = next((key for key in _DEPTHS if key in draw), None)
         if key is None:

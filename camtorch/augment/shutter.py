@@ -32,7 +32,6 @@ class RandomShutter(Augmentation):
     """
 
     keeps_lens: ClassVar[bool] = True
-    goes_last: ClassVar[bool] = True
 
     def __init__(
         self, readout: RangeLike, rates: RangeLike, *, direction: Direction = "down", **options: Unpack[EditOptions]
