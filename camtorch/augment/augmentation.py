@@ -185,7 +185,7 @@ class Augmentation(SampleTransform):
     # keeps_lens               RandomShutter
     # _labels_in_draws          RandomMount, for the depths of a shift
     # other_words              lenses and mounts
-    # _warp_options            Edit, whose warps choose what to antialias
+    # _chooses_antialias       edits; Compose
     # _draw_numbers            Compose, of all in it
     # _with_labels             RandomMount, for the depths of a shift; here boxes, for `crops`
     # _change                  Compose, step by step; Edit, by a matrix
@@ -268,7 +268,7 @@ class Augmentation(SampleTransform):
     def _part(self, source: Camera, draw: Draw) -> Part:
         """Return how samples of cameras of one model move, all of them, by a draw for as many."""
         target, rotation = self._filled_camera(source, values_for(source, draw))
-        return Part(source, Warp(source, target, rotation, **self._warp_options))
+        return Part(source, Warp(source, target, rotation, **self.options))
 
     def _filled_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         """Return the camera of drawn values and its rotation, zoomed and turned less far for `min_filled`."""
@@ -437,7 +437,7 @@ class Augmentation(SampleTransform):
     def extra_repr(self) -> str:
         parts = [f"camera={self.camera:g}"] if isinstance(self.camera, Guess) else []
         parts += [f"{name}={interval}" for name, interval in self.ranges.items()]
-        said = {"p": self.p, "same_on_batch": self.same_on_batch, **self._warp_options, "min_filled": self.min_filled}
+        said = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options, "min_filled": self.min_filled}
         return ", ".join(parts + [f"{name}={value!r}" for name, value in said.items()])
 
 

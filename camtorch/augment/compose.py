@@ -55,6 +55,7 @@ class Compose(Augmentation):
     """
 
     augmentations: nn.ModuleList
+    _chooses_antialias = True
 
     def __init__(self, augmentations: Iterable[Augmentation], **options: Unpack[EditOptions]):
         name = type(self).__name__

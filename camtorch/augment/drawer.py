@@ -169,7 +169,7 @@ class CameraDrawer(Augmentation):
         if start is None:
             target, rotation = self._filled_camera(source, values)
         else:
-            made = start.warp(source, values, self._warp_options)
+            made = start.warp(source, values, self.options)
             if self.min_filled:
                 self._tell_if_zoomed(source, made)
             options = self.options
@@ -185,7 +185,7 @@ class CameraDrawer(Augmentation):
         cameras, light = [target], None
         if "chromatic" in beside:  # red and blue are seen by cameras of their own
             cameras += [scaled(target, 1 + beside["chromatic"][..., i]) for i in (0, 1)]
-        warp, *others = [Warp.of_valid(source, camera, self._warp_options).turned_by(rotation) for camera in cameras]
+        warp, *others = [Warp.of_valid(source, camera, self.options).turned_by(rotation) for camera in cameras]
         if "vignetting" in beside:
             light = falloff(target, beside["vignetting"])
         if "cos4" in beside:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Unpack
+from typing import Unpack
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
@@ -48,10 +48,7 @@ class Edit(Augmentation):
 
     needs_camera = False
     drawn_on_host = True
-
-    @property
-    def _warp_options(self) -> Any:
-        return self.options
+    _chooses_antialias = True
 
     @abstractmethod
     def edit(self, size: tuple[int, int], values: Mapping[str, Tensor]) -> tuple[Map, tuple[int, int]]:
@@ -71,7 +68,7 @@ class Edit(Augmentation):
         return self.edit(size, nothing)[1]
 
     def _change(self, camera: Camera, draw: Draw) -> Change:
-        return change_by([(self, draw)], camera, self._warp_options)
+        return change_by([(self, draw)], camera, self.options)
 
     def map_of(self, draw: Draw, size: tuple[int, int]) -> tuple[Map | None, tuple[int, int]]:
         """Return the map of a draw for images of a size (None if it never applies), and the new size."""

@@ -124,7 +124,7 @@ class FaceNormalizer(SampleTransform):
         focal = (self.focal / self.distance * distance).expand(-1, 2)
         intrinsics = torch.cat((focal, focal.new_tensor(self.axis).expand(len(focal), 2)), -1)
         target = pinhole(intrinsics, self.image_size)
-        return Change(len(centre), [Part(camera, Warp(camera, target, rotation, **self._warp_options))])
+        return Change(len(centre), [Part(camera, Warp(camera, target, rotation, **self.options))])
 
     @on_samples
     def forward(self, sample: Mapping[str, Any] | None = None, **fields: Any) -> Sample:
@@ -182,7 +182,7 @@ class FaceNormalizer(SampleTransform):
         before = sample.get("source_rotation")
         rotation = rotation if before is None else rotation @ before.mT
         rotation = rotation if rotation.ndim == 3 else rotation.unsqueeze(0)
-        warp = Warp(source, normal, rotation.to(normal.intrinsics), **self._warp_options)
+        warp = Warp(source, normal, rotation.to(normal.intrinsics), **self.options)
         moved = self._moved(sample, batch, Change(batch.plan.count, [Part(source, warp)]).inverse())
         del moved["rotation"]
         moved.pop(PLACE, None)
@@ -196,5 +196,5 @@ class FaceNormalizer(SampleTransform):
         def __call__(self, *args: Any, **options: Any) -> Any: ...
 
     def extra_repr(self) -> str:
-        options = {"focal": self.focal, "distance": self.distance, "image_size": self.image_size, **self._warp_options}
+        options = {"focal": self.focal, "distance": self.distance, "image_size": self.image_size, **self.options}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())

@@ -176,7 +176,7 @@ class RandomMount(CameraDrawer):
         kind = _DEPTHS[key][1]
         depth = as_depth(draw[key], kind, source.size_for(self._name), self._name, draw[key].device)
         turned = part.warp.rotation
-        warp = ShiftedWarp(source, part.target, turned, depth, kind, shift, self._name, **self._warp_options)
+        warp = ShiftedWarp(source, part.target, turned, depth, kind, shift, self._name, **self.options)
         return replace(part, motion=warp)
 
 

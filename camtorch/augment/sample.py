@@ -29,7 +29,7 @@ from camtorch.values.arguments import as_flag, as_mapping, as_number, check_devi
 from camtorch.values.keywords import check_arguments
 from camtorch.values.module import GeometryModule
 from camtorch.values.threads import on_one_thread
-from camtorch.warp.options import Options, as_options
+from camtorch.warp.options import as_options
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -134,6 +134,8 @@ class SampleTransform(KeepsCamera, nn.Module):
     """Whether pinhole cameras become pinhole cameras, as far as that is known before a draw."""
     mirroring: Mirroring | None = None
     """What changes places in a mirror; None if it never mirrors."""
+    _chooses_antialias: ClassVar[bool] = False
+    """Whether its warps choose what to antialias if `antialias` is None, which is False for others."""
     _own_fields: ClassVar[Sequence[str]] = ("camera", "rotation", PLACE)
     """The names of fields that come out by themselves, and to which `fields` gives no kind."""
 
@@ -161,7 +163,9 @@ class SampleTransform(KeepsCamera, nn.Module):
         self.camera = camera
         self.fields: dict[str, str] = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
         check_kinds(self.fields, self._own_fields, self._name)
-        self.options: Options = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
+        # Options of `Warp`, or of a `HalvingWarp`, which takes None as antialias too
+        self.options: Any = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
+        self.antialias = antialias
         self.mask_fill: float = as_number(mask_fill, "mask_fill", self._name)
         self.valid_mask: bool = as_flag(valid_mask, "valid_mask", self._name)
 
@@ -175,24 +179,23 @@ class SampleTransform(KeepsCamera, nn.Module):
         state = dict(state)
         # before 0.5 it was one of these attributes that said to choose what to antialias
         chosen, decides = state.pop("antialias", False), state.pop("_warps_decide", False)
+        options = dict(state["options"])
         if chosen is None or decides:
-            state["options"] = {**state["options"], "antialias": None}
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
+            options["antialias"] = None
+        super().__setstate__({**state, "options": options})  # type: ignore[no-untyped-call]
         self._calls = Calls()  # which states before 0.5 lack
+        self.antialias = options["antialias"]
 
     @property
     def antialias(self) -> bool | None:
         """The option of that name."""
-        return self.options["antialias"]
+        chosen: bool | None = self.options["antialias"]
+        return chosen
 
     @antialias.setter
     def antialias(self, value: bool | None) -> None:
-        self.options["antialias"] = None if value is None else as_flag(value, "antialias", self._name)
-
-    @property
-    def _warp_options(self) -> Any:
-        """The `options` of its warps; for those that do not choose by themselves what to antialias, None is False."""
-        return {**self.options, "antialias": bool(self.options["antialias"])}
+        chosen = None if value is None else as_flag(value, "antialias", self._name)
+        self.options["antialias"] = False if chosen is None and not self._chooses_antialias else chosen
 
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
         """Return the sample and the keyword arguments as one new dict, which is a `Single` if the sample is."""

@@ -48,4 +48,4 @@ class RandomShutter(Augmentation):
     def _part(self, source: Camera, draw: Draw) -> Part:
         values = as_tensors(source, values_for(source, draw))
         shutter = RollingShutter(values["readout"], torch.deg2rad(values["rates"]), direction=self.direction)
-        return Part(source, ShutterWarp(source, source, target_shutter=shutter, **self._warp_options))
+        return Part(source, ShutterWarp(source, source, target_shutter=shutter, **self.options))

@@ -57,6 +57,7 @@ class CanonicalCamera(SampleTransform):
         ValueError: If the focal length is not positive, `scales` is another word, or a size is given with "depth".
     """
 
+    _chooses_antialias = True
     _own_fields: ClassVar[Sequence[str]] = (*SampleTransform._own_fields, "scale", "source_camera")
     focal: float
     image_size: tuple[int, int] | None
