@@ -363,23 +363,7 @@ class Change:
 
         Edits leave values as they are; another lens or mount sees the same distance at another depth.
         """
-
-        def ahead(camera: Camera, like: Tensor) -> Tensor:
-            """Return the z of every pixel's ray, (n or 1, 1, H, W); 0 without a ray."""
-            rays, valid = camera.rays()
-            z = (rays[..., 2] * valid).to(like)
-            return z.reshape(-1, 1, *z.shape[-2:])
-
-        def move(part: Part, rows: Tensor) -> Tensor:
-            warp = part.warp
-            if warp.keeps_depth:
-                return warp.moved_distance(rows)
-            wide = widen(rows)
-            before, after = (ahead(camera, wide) for camera in (warp.source, warp.target))
-            distance = torch.where(before.abs() > 1e-6, wide / before, 0.0)
-            return narrow(warp.moved_distance(distance) * after, rows.dtype)
-
-        return self.each(depth, move)
+        return self.each(depth, lambda part, rows: part.warp.moved_depth(rows))
 
 
 def by_models(

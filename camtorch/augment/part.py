@@ -20,6 +20,7 @@ from camtorch.values.module import remade
 from camtorch.warp.affine import AffineWarp, HalvingWarp, after, made_like
 from camtorch.warp.options import Options
 from camtorch.warp.panorama import seam_of
+from camtorch.warp.shutter import ShutterWarp
 from camtorch.warp.warp import Warp
 
 
@@ -27,13 +28,10 @@ from camtorch.warp.warp import Warp
 class LazyWarp:
     """A warp to cameras of which native code wrote the numbers; warp and cameras become modules at first use.
 
-    Changes and plans ask a `Warp` and a `LazyWarp` by the same names: `target`, `new_target`, `rotation`, `image_size`,
-    `options`, `natives`, `transform_positions`, and the flags, which `RoutedWarp` explains.
+    Changes and plans ask a `Warp` and a `LazyWarp` by the same names, those with a star in the table of `RoutedWarp`.
     """
 
-    joins_earlier: ClassVar[bool] = False
     moves_by_cameras: ClassVar[bool] = True
-    is_drawn: ClassVar[bool] = True
     like: Camera  # the new cameras are of its model
     intrinsics: np.ndarray[Any, Any]  # (4,) of one, or (B, 4)
     distortion: np.ndarray[Any, Any]  # (n,) of one, or (B, n)
@@ -138,7 +136,7 @@ class Part:
 
         def taken(warp: Warp) -> Warp:
             rotation = warp.rotation if warp.rotation is None or warp.rotation.ndim == 2 else warp.rotation[index]
-            return warp.rows_of(camera, of(warp.target), rotation, index)
+            return made_like(warp, camera, of(warp.target), rotation, warp.options, index)
 
         camera, light = of(self.camera), self.light
         light = light if light is None or len(light) == 1 else light[index]
@@ -151,9 +149,8 @@ class Part:
             return self
         if first is None:
             return replace(second, camera=self.camera)
-        if last.joins_earlier:
-            made = second.warp
-            return self.with_warps(lambda warp: made.between(warp.source, warp.target, warp.rotation, **made.options))
+        if isinstance(last, ShutterWarp):
+            return self.with_warps(lambda warp: last.between(warp.source, warp.target, warp.rotation, **last.options))
         rotation = _turned(first.rotation, last.rotation)
         if isinstance(last, AffineWarp):
             return self._edited(last, rotation)
@@ -164,7 +161,7 @@ class Part:
             )
         are_known = rotation is None or are_numbers(rotation)  # else the rotation may learn
         if isinstance(last, LazyWarp) and are_known and not self.camera.batch_shape:
-            natives = first.natives if first.is_drawn else None
+            natives = first.natives if isinstance(first, LazyWarp) else None
             native = _single(self.camera) if natives is None else natives[0]
             return replace(second, camera=self.camera, motion=last.starting_at(native, rotation))
         moved = second.with_warps(lambda warp: HalvingWarp(self.camera, warp.target, rotation, **warp.options))

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from camtorch.augment.change import Change
 from camtorch.augment.fields import KINDS, Named, field_of
-from camtorch.augment.part import Part
+from camtorch.augment.part import LazyWarp, Part
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_free, are_numbers, known_true
@@ -114,7 +114,7 @@ class SamplePlan:
                 return {}
         # 3. The call is kept by all that it depends on, beside the form
         labels: Sequence[Label] = ()
-        if motion.is_drawn and self.count == 1:
+        if isinstance(motion, LazyWarp) and self.count == 1:
             labels = _LABELS_OF_MIRRORS if motion.may_mirror else _LABELS_OF_TURNS
         size = motion.image_size
         settings = size, source.dtype, labels, thread_count(), *motion.options.values()

@@ -61,7 +61,6 @@ class HalvingWarp(Warp):
     def __init__(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any):
         super().__init__(source, target, None, **options)
         self.turned_by(rotation)
-        self._halvings: list[int] | None = None
 
     def warped(self, images: Tensor, sampler: Sampler, route: Route | None = None) -> Tensor:
         """Return warped images; each one may be copied, resized, or halved and sampled, see `ImageEdit`."""
@@ -100,10 +99,11 @@ class HalvingWarp(Warp):
         """Return the edit of each image, or one for all; None to sample as any `Warp` does."""
         if not (self.antialias is None and smooth and route == "kept" and are_concrete(self.target.intrinsics)):
             return None
-        if self._halvings is None:
+        kept = self._positions()
+        if kept.halvings is None:
             known = self.host or self  # the warp on the CPU, whose values need no wait
-            self._halvings = _halvings(known.positions("kept", sampler.padding_mode), known.sampled.source)
-        return [ImageEdit(sampler.padding_mode, k) for k in self._halvings] if any(self._halvings) else None
+            kept.halvings = _halvings(known.positions("kept", sampler.padding_mode), known.sampled.source)
+        return [ImageEdit(sampler.padding_mode, k) for k in kept.halvings] if any(kept.halvings) else None
 
     def _made(
         self,
@@ -149,7 +149,6 @@ class AffineWarp(HalvingWarp):
     """
 
     moves_by_cameras = False
-    keeps_depth = True
     seam = None
     map: Map
     matrix: Tensor
@@ -180,6 +179,10 @@ class AffineWarp(HalvingWarp):
     def inverse(self) -> Warp:
         """Return the inverse edit. Pixels that this edit cut off stay lost."""
         return AffineWarp(self.target, self.source, inverted(self.map), transposed(self.rotation), **self.options)
+
+    def moved_depth(self, depth: Tensor) -> Tensor:
+        """Return depths (B, 1, H, W) where the edit moves them: their values stay, as the camera does."""
+        return self.moved_distance(depth)
 
     def pin(self) -> Warp:
         """Return this warp: pure copies need no sampling positions, others keep them from the first call."""
@@ -230,10 +233,18 @@ class AffineWarp(HalvingWarp):
         return placed(self.target, moved.to(torch.promote_types(pixels.dtype, torch.float32)), valid, on_image)
 
 
-def made_like(warp: Warp, source: Camera, target: Camera, rotation: Tensor | None, options: Options) -> Warp:
-    """Return a warp like another one between other cameras, of which neither cameras nor rotation are checked."""
-    make = HalvingWarp if warp.moves_by_cameras else warp.between
-    return make(source, target, rotation, **options)
+def made_like(
+    warp: Warp,
+    source: Camera,
+    target: Camera,
+    rotation: Tensor | None,
+    options: Options,
+    rows: list[int] | None = None,
+) -> Warp:
+    """Return a warp like another one, or these rows of it, between other cameras; the rotation is not checked."""
+    if warp.moves_by_cameras:
+        return HalvingWarp(source, target, rotation, **options)
+    return warp.between(source, target, rotation, **options, **warp.own_parts(rows))
 
 
 def _copied(images: Tensor, move: tuple[int, ...], result: Tensor, fill: tuple[float, ...]) -> Tensor:

@@ -73,6 +73,7 @@ class KeptPositions:
         """Keep positions by the padding that they serve; `pinned` ones, of these `paddings`, stay if cameras change."""
         self.is_pinned = pinned is not None
         self.calls: dict[tuple[object, ...], Call] = {}
+        self.halvings: list[int] | None = None  # how often a `HalvingWarp` halves the image of each camera, once asked
         self._found: dict[str, Positions] = {} if pinned is None else dict.fromkeys(paddings, pinned)
 
     def serving(self, padding: str, compute: Callable[[], Positions]) -> Positions:
@@ -94,13 +95,30 @@ class KeptPositions:
 
 
 class RoutedWarp(GeometryModule):
-    """The state of a `Warp`: source, target, rotation and options; and the routes to the positions of its pixels."""
+    """The state of a `Warp`: source, target, rotation and options; and the routes to the positions of its pixels.
 
-    moves_by_cameras: ClassVar[bool] = True  # and a rotation: native code and operators need no more
-    joins_earlier: ClassVar[bool] = False  # True: after another warp both are one, `between` the cameras of that
-    keeps_depth: ClassVar[bool] = False  # True: depths along the axis stay, as the camera does
-    may_mirror: ClassVar[bool] = False  # True: the rotation may be a mirror
-    is_drawn: ClassVar[bool] = False  # True: it is of numbers that native code drew; then it turns labels, too
+    Packages ask every kind of warp by its public names and by these. A `LazyWarp` has those with a star, and `target`,
+    `rotation`, `image_size` and `options`.
+
+    * `moves_by_cameras` *: both cameras and the rotation are all that native code and operators need. Not of an
+      `AffineWarp`, `PlaneWarp`, `ShiftedWarp` or `ShutterWarp`, which have their own of some of the names below.
+    * `may_mirror` *: the rotation may be a mirror, as that of a `HalvingWarp` and of the kinds derived from it.
+    * `natives` *: source and target for native code, or None. `new_target` *: a copy of the target.
+    * `tensors`: all that positions depend on. `locate`: positions of rows. `move`: pixels there and back. All three are
+      of its own for an `AffineWarp`, a `PlaneWarp` and a `ShiftedWarp`.
+    * `pair`: the cameras by which pixels move; those of a `ShutterWarp` are behind their shutters.
+    * `seam`: how images of a whole turn are lengthened; None for an `AffineWarp` and a `ShiftedWarp`.
+    * `transform_positions` *, `moved_distance`, `moved_depth`: points in space, and images of distances and depths, as
+      the target sees them. A `ShiftedWarp` moves them by its shift, an `AffineWarp` keeps depths, and a `PlaneWarp`
+      raises an error, as it knows the depth of its plane alone.
+    * `own_parts`, `between`: what a kind is made of besides cameras, rotation and options, and a new one of all that.
+      `detach`, `inverse` and `made_like` need both. Kinds without parts have none of their own.
+
+    A `CropsWarp` passes all that it is asked for images and labels on to a warp of B * F rows.
+    """
+
+    moves_by_cameras: ClassVar[bool] = True
+    may_mirror: ClassVar[bool] = False
     source: Camera = _held_in("_modules", "source")
     target: Camera = _held_in("_modules", "target")
     rotation: Tensor | None = _held_in("_buffers", "rotation")
@@ -132,7 +150,7 @@ class RoutedWarp(GeometryModule):
     def __dir__(self) -> list[str]:
         """Return the names that users call, without those by which packages and other kinds of warps ask this one."""
         inside = {*vars(RoutedWarp), *dir(GeometryModule)}
-        inside |= {"rows_of", "own_parts", "transform_positions", "moved_distance"}
+        inside |= {"own_parts", "transform_positions", "moved_distance", "moved_depth"}
         inside -= {"source", "target", "rotation", "tolerance", *dir(nn.Module)}
         names: list[str] = super().__dir__()  # type: ignore[no-untyped-call]
         return [name for name in names if name not in inside]

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from camtorch.cameras.camera import Camera
+from camtorch.evaluate.kept import Kept
 from camtorch.rays.depth import depth_scale
 from camtorch.warp.camera_pair import placed
 from camtorch.warp.lattice import PixelPositions, to_positions
@@ -54,7 +55,7 @@ class ShiftedWarp(Warp):
         self.batch_shape: torch.Size = torch.Size((count,))
         self.register_buffer("shift", shift.to(rays), persistent=False)
         self.register_buffer("distance", distance, persistent=False)
-        self._found: tuple[Tensor, Tensor] | None = None
+        self._surfaces = Kept()
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
         return ShiftedWarp(source, target, rotation, **{**self.own_parts(), **options})
@@ -63,6 +64,10 @@ class ShiftedWarp(Warp):
         rows = slice(None) if index is None else index
         depth, shift = self.distance[rows][:, None], self.shift[rows]
         return {"depth": depth, "kind": "distance", "shift": shift, "owner": self._owner}
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        return [*super().tensors, self.shift, self.distance]
 
     def inverse(self) -> Warp:
         raise ValueError(
@@ -100,22 +105,23 @@ class ShiftedWarp(Warp):
         moved, mapped = self.target.project(self.transform_positions(rays * length[..., None]))
         return placed(self.target, moved, has_ray & mapped & (length > 0), on_image)
 
-    @torch.no_grad()
     def _surface(self) -> tuple[Tensor, Tensor]:
         """Return the source's pixel (B, H', W', 2) that shows what each target pixel sees, and whether there is one."""
-        if self._found is None:
-            size = self.image_size
-            rays, has_ray = self.target.rays()
-            far = self._nearest(size).flatten(1)
-            count = len(far)
-            rays, has_ray = rays.expand(count, *size, 3).flatten(1, 2), has_ray.expand(count, *size).flatten(1)
-            turned = rays if self.rotation is None else rays @ self.rotation.to(rays)
-            seen, good = turned.new_empty(count, *size, 2), has_ray.new_empty(count, *size)
-            for i in range(count):
-                pixels, meets = self._followed(i, turned[i], has_ray[i], far[i])
-                seen[i], good[i] = pixels.view(*size, 2), meets.view(size)
-            self._found = seen, good
-        return self._found
+        return self._surfaces(self.tensors, self.form, self._found_surface)
+
+    @torch.no_grad()
+    def _found_surface(self) -> tuple[Tensor, Tensor]:
+        size = self.image_size
+        rays, has_ray = self.target.rays()
+        far = self._nearest(size).flatten(1)
+        count = len(far)
+        rays, has_ray = rays.expand(count, *size, 3).flatten(1, 2), has_ray.expand(count, *size).flatten(1)
+        turned = rays if self.rotation is None else rays @ self.rotation.to(rays)
+        seen, good = turned.new_empty(count, *size, 2), has_ray.new_empty(count, *size)
+        for i in range(count):
+            pixels, meets = self._followed(i, turned[i], has_ray[i], far[i])
+            seen[i], good[i] = pixels.view(*size, 2), meets.view(size)
+        return seen, good
 
     def _followed(self, i: int, rays: Tensor, has_ray: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
         """Return pixels (N, 2) where sample i's rays (N, 3) from the new place meet a surface, and whether they do."""

@@ -171,8 +171,6 @@ class ShutterWarp(HalvingWarp):
     """
 
     moves_by_cameras = False
-    joins_earlier = True
-    _has_shutters = True
     shutter: RollingShutter | None
     target_shutter: RollingShutter | None
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -26,7 +26,7 @@ from camtorch.values.arguments import (
     no_camera,
     one_of,
 )
-from camtorch.values.dtypes import check_averaged
+from camtorch.values.dtypes import check_averaged, narrow, widen
 from camtorch.values.module import typed_as
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
@@ -84,8 +84,6 @@ class Warp(RoutedWarp):
             batch dims do not fit, or fill or tolerance is not valid.
         TypeError: If source or target is no Camera.
     """
-
-    _has_shutters: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -281,6 +279,13 @@ class Warp(RoutedWarp):
         """Return distances (B, C, H, W) from the source as distances (B, C, H', W') from the target, 0 for none."""
         return self.pin()(distance, mode="nearest", padding_mode="zeros", fill=0.0)
 
+    def moved_depth(self, depth: Tensor) -> Tensor:
+        """Return depths along the source's z (B, 1, H, W) as those along the target's z (B, 1, H', W'), 0 for none."""
+        wide = widen(depth)
+        before, after = _ahead(self.source, wide), _ahead(self.target, wide)
+        distance = torch.where(before.abs() > 1e-6, wide / before, 0.0)
+        return narrow(self.moved_distance(distance) * after, depth.dtype)
+
     def __getattr__(self, name: str) -> Tensor | nn.Module:
         try:
             return super().__getattr__(name)
@@ -311,10 +316,6 @@ class Warp(RoutedWarp):
         parts = {name: part.detach() if hasattr(part, "detach") else part for name, part in parts.items()}
         return self.between(self.source.detach(), self.target.detach(), **self.options, **parts).share(self)
 
-    def rows_of(self, source: Camera, target: Camera, rotation: Tensor | None, index: list[int]) -> Warp:
-        """Return the warp of these rows of a batch, whose cameras and rotations are given."""
-        return self.between(source, target, rotation, **self.options, **self.own_parts(index))
-
     @property
     def options(self) -> Options:
         """Options with which another `Warp` samples in the same way."""
@@ -327,18 +328,25 @@ class Warp(RoutedWarp):
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        lost = [name for name in ("shutter", "target_shutter") if state["_modules"].get(name) is not None]
-        if lost and not self._has_shutters:
-            raise ValueError(f"{type(self).__name__}: a saved warp must have no {lost[0]}; got one of 0.3. {LEFT}")
         if state.pop("_decides", False):  # an attribute before 0.5
             state["antialias"] = None
         super().__setstate__(state)
+        for name in ("shutter", "target_shutter"):
+            if self._modules.get(name) is not None and name not in self.own_parts():
+                raise ValueError(f"{type(self).__name__}: a saved warp must have no {name}; got one of 0.3. {LEFT}")
 
     def extra_repr(self) -> str:
         """Return the options, then "learns" if a camera or the rotation requires grad, else "fixed"."""
         said = {**self.options, "tolerance": self.tolerance, "rotation": self.rotation is not None}
         learns = any(t.requires_grad for t in (*self.parameters(), *self.buffers()))
         return ", ".join([*(f"{name}={value!r}" for name, value in said.items()), "learns" if learns else "fixed"])
+
+
+def _ahead(camera: Camera, like: Tensor) -> Tensor:
+    """Return the z of every pixel's ray, (B or 1, 1, H, W); 0 without a ray."""
+    rays, valid = camera.rays()
+    z = (rays[..., 2] * valid).to(like)
+    return z.reshape(-1, 1, *z.shape[-2:])
 
 
 def checked(

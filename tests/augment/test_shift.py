@@ -178,3 +178,22 @@ def test_depths_in_a_list_move_as_those_of_single_samples(plane):
         alone = augment(one, camera=camera, draw={name: value[i : i + 1] for name, value in draw.items()})
         torch.testing.assert_close(out["image"][i], alone["image"])
         torch.testing.assert_close(out["distance"][i], alone["distance"][plane])
+
+
+def test_when_the_numbers_of_a_warp_change_it_looks_for_the_surface_again():
+    camera = lens()
+    sample = sample_of(camera)
+    augment, distance = ct.augment.RandomMount(shift=((0.02, 0.03),) * 3), sample["distance"][None]
+    change = augment.change(camera, {**augment.draw(1), "of_distance": distance})
+    warp, before = change.parts[0].warp, change.distance(distance)
+    numbers = warp.source.intrinsics, warp.target.intrinsics, warp.rotation, warp.shift, warp.distance
+    for number in numbers:
+        given = number.detach().clone()
+        number.data.mul_(1.01)
+        moved = change.distance(distance)
+        assert not torch.equal(moved, before)
+        assert torch.equal(moved, warp.detach().moved_distance(distance))
+        number.data.copy_(given)
+        assert torch.equal(change.distance(distance), before)
+    warp.float()
+    assert torch.equal(change.distance(distance.float()), warp.detach().moved_distance(distance.float()))

@@ -9,7 +9,7 @@ import torch
 
 import camtorch as ct
 from camtorch.poses.rotations import rotation_matrix
-from camtorch.warp.affine import AffineWarp, HalvingWarp
+from camtorch.warp.affine import AffineWarp, HalvingWarp, made_like
 from camtorch.warp.shifted import ShiftedWarp
 
 SIZE, SMALL = (24, 32), (10, 14)
@@ -217,10 +217,19 @@ def test_detached_and_row_by_row_it_keeps_all_that_it_is_made_of(kind):
     if kind in ("plane", "above"):
         return
     rotation = None if warp.rotation is None else warp.rotation[[1]]
-    row = warp.rows_of(warp.source[[1]], warp.target[[1]], rotation, [1])
-    assert type(row) is type(warp)
+    row = made_like(warp, warp.source[[1]], warp.target[[1]], rotation, warp.options, [1])
+    assert isinstance(row, type(warp))
     for one, other in zip(results(row, images[1:], points[1:]), expected, strict=True):
         torch.testing.assert_close(one, other[1:], rtol=1e-9, atol=1e-9)
+
+
+def test_how_often_an_image_is_halved_follows_the_cameras():
+    p, images = {name: torch.tensor(NUMBERS[name]) for name in CAMERAS}, smooth(dtype=torch.float32)
+    warp = turned(HalvingWarp, p, antialias=None).requires_grad_(False)
+    whole = warp(images)
+    warp.target.intrinsics.data[:2] /= 4
+    assert not torch.equal(warp(images), whole)
+    assert torch.equal(warp(images), warp.detach()(images))
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.uint16, torch.float16, torch.float32])
