@@ -192,10 +192,12 @@ class AffineWarp(HalvingWarp):
         return not self._numbers
 
     def _edits(self, sampler: Sampler, smooth: bool, route: Route) -> list[ImageEdit] | None:
-        least = {True: 1.0, None: SHRINKS, False: math.inf}[self.antialias] if smooth else math.inf
-        decides = smooth and self.antialias is None and route == "kept"
+        least = math.inf  # how many source pixels become one where torch resizes
+        if smooth and self.antialias is not False:
+            least = 1.0 if self.antialias else SHRINKS
         sizes = self.source.size_for("Warp"), self.image_size
-        return [_edit_of(rows, *sizes, sampler.padding_mode, least, decides) for rows in self._numbers]
+        may_halve = smooth and self.antialias is None and route == "kept"
+        return [_edit_of(rows, *sizes, sampler.padding_mode, least, may_halve) for rows in self._numbers]
 
     @property
     def tensors(self) -> list[Tensor]:
@@ -278,7 +280,7 @@ def _resized(images: Tensor, size: Sequence[int], mode: str = "bilinear", flips:
 
 
 def _edit_of(
-    rows: Rows, source: tuple[int, int], target: tuple[int, int], padding: PaddingMode, least: float, decides: bool
+    rows: Rows, source: tuple[int, int], target: tuple[int, int], padding: PaddingMode, least: float, may_halve: bool
 ) -> ImageEdit:
     """Return how a map edits images of one size into another; torch resizes if more than `least` pixels become one."""
     (a, b, left), (c, d, top) = rows
@@ -296,7 +298,7 @@ def _edit_of(
     box = _whole((x, y, right, bottom), slack)
     if box and is_inside and b == 0 and max(abs(a), abs(d)) > least:
         return ImageEdit(padding, box=box, flips=tuple(dim for dim, sign in ((-1, a), (-2, d)) if sign < 0))
-    halvings = _halved((math.hypot(a, c) + math.hypot(b, d)) / 2) if decides else 0
+    halvings = _halved((math.hypot(a, c) + math.hypot(b, d)) / 2) if may_halve else 0
     # a target inside of the source, up to the outer edges of its pixels, needs no padding
     return ImageEdit("border" if is_inside and padding == "zeros" else padding, halvings)
 

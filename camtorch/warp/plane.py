@@ -206,14 +206,14 @@ class BirdsEye(PlaneWarp):
         resolution = as_number(resolution, "resolution", "BirdsEye")
         if not (math.isfinite(resolution) and resolution > 0):
             raise ValueError(f"BirdsEye: resolution must be positive units of the ground per pixel; got {resolution}")
-        size = tuple(round((ends[1] - ends[0]) / resolution) for ends in (y, x))
-        if min(size) < 1:
+        height, width = (round((high - low) / resolution) for low, high in (y, x))
+        if min(height, width) < 1:
             raise ValueError(f"BirdsEye: x and y must span a pixel; got {x} and {y} at {resolution} units per pixel")
         # a camera that looks straight down from one unit above the origin
         like = camera.intrinsics.detach() if isinstance(camera, Camera) else torch.zeros(1)
         focal = 1 / resolution
         intrinsics = like.new_tensor([focal, focal, -x[0] * focal - 0.5, y[1] * focal - 0.5])
-        down = pinhole(intrinsics, (size[0], size[1]))
+        down = pinhole(intrinsics, (height, width))
         super().__init__(camera, down, extrinsics, (0.0, 0.0, 1.0), 1.0, **options)
         self.x, self.y, self.resolution = x, y, resolution
 

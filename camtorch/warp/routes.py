@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from functools import partial
 from typing import Any, ClassVar, Literal, Self
 
@@ -246,7 +245,9 @@ class RoutedWarp(GeometryModule):
     def new_target(self, batch: tuple[int, ...]) -> Camera:
         """Return a copy of the target, of batch dims (B,) or, of one camera, of none."""
         target = self.target
-        return (target.expand(*batch) if batch or not target.batch_shape else target[0]).clone()
+        if target.batch_shape and not batch:
+            return target[0].clone()
+        return target.expand(*batch).clone()
 
     def locate(self, rows: range, padding: PaddingMode, tolerance: float) -> Positions:
         """Return positions of some rows of the target, which serve a padding, within a tolerance."""
@@ -314,20 +315,18 @@ class RoutedWarp(GeometryModule):
             for rows, strip, _ in self.in_strips(images, sampler):
                 result[:, :, rows] = strip
             return result
-        given, images = images, self.lengthened(images)
+        sampled = self.lengthened(images)
         if route == "operator":
-            options = self.tolerance, self.antialias, serving_all(self.padding_mode, sampler.padding_mode), sampler
-            return compiled.warped(images, self.sampled, *options)
-        known: KeptPositions | None = self._kept.result
+            padding = serving_all(self.padding_mode, sampler.padding_mode)
+            return compiled.warped(sampled, self.sampled, self.tolerance, self.antialias, padding, sampler)
+        earlier: KeptPositions | None = self._kept.result  # None in the first call, the only one of most warps
         where = self.positions(route, sampler.padding_mode)
-        call = prepared(images, where, sampler)
+        call = prepared(sampled, where, sampler)
         if call is None:
-            return by_torch(images, where, sampler)
-        result = call(images)
-        # from the second call on, as most warps have one: `known` was read before `positions` made the entry
-        if known is not None and images is given and sampler.fill == self.fill:
-            known.keep(call, self._form_of(images, sampler.mode, sampler.padding_mode), where)
-        return result
+            return by_torch(sampled, where, sampler)
+        if earlier is not None and sampled is images and sampler.fill == self.fill:
+            earlier.keep(call, self._form_of(images, sampler.mode, sampler.padding_mode), where)
+        return call(sampled)
 
     def lengthened(self, images: Tensor) -> Tensor:
         """Return the images that are sampled: those of a whole turn go on beyond their edges."""
@@ -336,28 +335,30 @@ class RoutedWarp(GeometryModule):
 
     def positions(self, route: Route, padding: PaddingMode = "zeros") -> Positions:
         """Return the positions at which target pixels sample the source's image: kept ones unless they have a graph."""
-        is_traced, tolerance = in_jit_trace(), self.tolerance
-        served = serving_all(self.padding_mode, padding)  # what is kept then serves calls of both
+        served, tolerance = serving_all(self.padding_mode, padding), self.tolerance
         if route == "graph":
-            if is_traced:
+            if in_jit_trace():
                 raise RuntimeError(
                     "Warp: cameras must not learn in torch.jit.trace and torch.onnx.export(dynamo=False); got some "
                     "that do. Use torch.onnx.export(dynamo=True) or torch.export; or make the map a constant by "
                     "warp.requires_grad_(False)"
                 )
             return self.locate(range(self.image_size[0]), served, tolerance)
-        constant = self._constant(padding) if records_constants() else None
-        if constant is not None:
-            return constant
-        with set_aside() if is_traced else nullcontext():
-            # exact positions serve every padding, so one entry is enough
-            served = served if tolerance else "zeros"
-            where = self._positions().serving(served, partial(self.computed, served, tolerance))
-            return where.pixels if is_traced else where  # constants of the trace
+        if records_constants() and (self.is_pinned or is_constant(self)):
+            return self._constant(padding)
+        if in_jit_trace():
+            with set_aside():  # constants of the trace
+                return self.positions(route, padding).pixels
+        # exact positions serve every padding, so one entry is enough
+        served = served if tolerance else "zeros"
+        return self._positions().serving(served, partial(self.computed, served, tolerance))
 
     def _positions(self) -> KeptPositions:
-        known: KeptPositions = self._kept.result
-        return known if known is not None and known.is_pinned else self._kept(self.tensors, self.form, KeptPositions)
+        """Return the positions that are pinned, or those of the cameras as they are."""
+        known: KeptPositions | None = self._kept.result
+        if known is not None and known.is_pinned:
+            return known
+        return self._kept(self.tensors, self.form, KeptPositions)
 
     def by_pixel(self) -> PixelPositions:
         """Return the positions of all pixels, one by one."""
@@ -365,16 +366,15 @@ class RoutedWarp(GeometryModule):
 
     def computed(self, padding: PaddingMode, tolerance: float) -> Positions:
         """Return the positions of all pixels, without a graph, which serve a padding within a tolerance."""
-        if tolerance:
-            host = None if self.antialias else self.host
-            if host is not None:
-                return host.positions("kept", padding).on(self.target.intrinsics.device)
-            if self.goes_by_operator():
-                sampled = self.sampled
-                planes, mapped = compiled.positions(*sampled, tolerance, padding)
-                grid = planes.movedim(1, -1)
-                scale = local_scale(grid, mapped, sampled.source) if self.antialias else None
-                return PixelPositions(grid, mapped, scale)
+        host = self.host if tolerance and not self.antialias else None
+        if host is not None:
+            return host.positions("kept", padding).on(self.target.intrinsics.device)
+        if tolerance and self.goes_by_operator():
+            sampled = self.sampled
+            planes, mapped = compiled.positions(*sampled, tolerance, padding)
+            grid = planes.movedim(1, -1)
+            scale = local_scale(grid, mapped, sampled.source) if self.antialias else None
+            return PixelPositions(grid, mapped, scale)
         return self.locate(range(self.image_size[0]), padding, tolerance)
 
     def strip_positions(
@@ -382,9 +382,11 @@ class RoutedWarp(GeometryModule):
     ) -> Iterator[tuple[slice, Positions]]:
         """Yield rows of the target, `count` at a time, and their positions on the source's image."""
         height, width = self.image_size
-        step = count or max(_STRIP_PIXELS // (max(math.prod(self.batch_shape), 1) * width), 1)
-        for top in range(0, height, step):
-            rows = range(top, min(top + step, height))
+        if count is None:
+            pixels_of_row = max(math.prod(self.batch_shape), 1) * width
+            count = max(_STRIP_PIXELS // pixels_of_row, 1)
+        for top in range(0, height, count):
+            rows = range(top, min(top + count, height))
             with torch.no_grad():
                 where = self.locate(rows, serving_all(self.padding_mode, padding), self.tolerance)
             yield slice(rows.start, rows.stop), where
@@ -406,16 +408,13 @@ class RoutedWarp(GeometryModule):
         pixels = (grid + 1) * grid.new_tensor(source.size_for("Warp")[::-1]) / 2 - 0.5
         return (where.pixels.mapped & source.contains(pixels)).unsqueeze(1)
 
-    def _constant(self, padding: PaddingMode) -> Positions | None:
-        """Return the positions as a constant of an exported program; None if they depend on its inputs."""
-        if not self.is_pinned and not is_constant(self):
-            return None
+    def _constant(self, padding: PaddingMode) -> Positions:
+        """Return the positions, which are known, as a constant of an exported program."""
+
+        def own() -> PixelPositions:
+            where = self.positions("kept", padding).pixels
+            grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
+            return where._replace(grid=grid, mapped=mapped)
+
         with set_aside() if self.is_pinned else with_values(self):
-
-            def own() -> PixelPositions:
-                where = self.positions("kept", padding).pixels
-                grid, mapped = (t.detach().clone(memory_format=torch.contiguous_format) for t in where[:2])
-                return where._replace(grid=grid, mapped=mapped)
-
-            known, served = self._positions(), serving_all(self.padding_mode, padding)
-            return own() if known.is_pinned else known.serving(f"constant {served}", own)
+            return self._positions().serving(f"constant {serving_all(self.padding_mode, padding)}", own)
