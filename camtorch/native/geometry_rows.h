@@ -269,8 +269,9 @@ static NOT_INLINE void T(to_plane_block_vjp)(const T(Camera) *c, int n, const R 
     })
 }
 
-/* The cotangents of points and numbers of those of pixels; `sums`: of intrinsics, then of the parts */
-static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count, double *sums) {
+/* The cotangents of points and numbers of those of pixels; `sums`: of intrinsics, then of the parts. How many wait for
+   limits */
+static int T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera, int64_t first, int count, double *sums) {
     const int n = (count + LANES - 1) & -LANES;
     const int64_t *from = rows->row_strides, *to = rows->result_strides, *by = rows->cotangent_strides;
     const R *points = (const R *)rows->rows + camera * from[0] + first * from[1];
@@ -279,7 +280,8 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
     T(Seen) s;
     ALIGNED R gu[BLOCK], gv[BLOCK], gx[BLOCK], gy[BLOCK], gz[BLOCK], by_angle[BLOCK];
     T(load_points)(points, from, count, n, s.x, s.y, s.z);
-    T(to_plane_block)(c, 1, count, n, &s);
+    const int waiting = T(to_plane_block)(c, 1, count, n, &s);
+    if (waiting) return waiting;
     const R *to_u = T(load)(cotangents, by[1], count, n, gx, 0);
     const R *to_v = T(load)(cotangents + by[2], by[1], count, n, gy, 0);
     EACH(i) {
@@ -300,11 +302,12 @@ static void T(project_vjp)(const T(Camera) *c, const Rows *rows, int64_t camera,
         EACH(i) by_angle[i] = 1 / (gy[i] + 2 * gx[i] * gz[i]);
     }
     if (sums) T(to_plane_sums)(c, n, s.x, s.y, s.z, s.scale, by_angle, gu, gv, sums);
-    if (!rows->results) return;
+    if (!rows->results) return 0;
     const int swapped = c->swapped;
     T(to_plane_block_vjp)(c, n, swapped ? s.y : s.x, swapped ? s.x : s.y, s.z, s.shrink, s.scale, by_angle, swapped ? gv : gu,
              swapped ? gu : gv, swapped ? gy : gx, swapped ? gx : gy, gz);
     T(store)((R *)rows->results + camera * to[0] + first * to[1], to, 3, count, gx, gy, gz);
+    return 0;
 }
 
 /* -- pixels to rays */
@@ -688,7 +691,7 @@ static int64_t T(rows)(const Rows *rows) {
             switch (rows->direction) {
             case PROJECT: left += T(project)(&camera, rows, index, i, count); break;
             case UNPROJECT: left += T(unproject)(&camera, rows, index, i, count); break;
-            case PROJECT_VJP: T(project_vjp)(&camera, rows, index, i, count, sums); break;
+            case PROJECT_VJP: left += T(project_vjp)(&camera, rows, index, i, count, sums); break;
             default: T(unproject_vjp)(&camera, rows, index, i, count, sums);
             }
         }

@@ -14,7 +14,7 @@ from torch import Tensor
 from camtorch.native import memory, structs
 from camtorch.native.library import loaded
 from camtorch.native.sampler import PADDING_CODES
-from camtorch.projection.native_cameras import Native, address
+from camtorch.projection.native_cameras import Native
 from camtorch.values.threads import spread, thread_count
 
 _Call = TypeVar("_Call")
@@ -55,9 +55,7 @@ def _evaluate(
     call.results, call.result_strides[:] = results.data_ptr(), (count, 1, cameras * count)
     if solution is not None:
         call.solution = solution.data_ptr()
-    if _call(native, cameras, count, call):  # a point lies so far out that the limits of each azimuth decide
-        native.follow()
-        _call(native, cameras, count, call)
+    _call(native, cameras, count, call)
     return results, valid
 
 
@@ -80,15 +78,14 @@ def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[
     """
     cameras, count, _ = points.shape
     by_points = torch.empty(2, cameras, count, 3, dtype=native.dtype, device="cpu")
-    sums = torch.zeros(2, cameras, count, (4 + native.plan.parameters) * by_camera, dtype=torch.float64, device="cpu")
+    sums = torch.empty(2, cameras, count, (4 + native.plan.parameters) * by_camera, dtype=torch.float64, device="cpu")
     tile = 1 if by_camera else _TILE_POINTS
     for one, by, to in zip(torch.eye(2, dtype=native.dtype, device="cpu"), by_points, sums, strict=True):
         call = structs.Rows()
         call.rows, call.row_strides[:], call.direction = points.data_ptr(), points.stride(), structs.PROJECT_VJP
         call.results, call.result_strides[:] = by.data_ptr(), by.stride()
         call.cotangents, call.cotangent_strides[:] = one.data_ptr(), (0, 0, 1)
-        call.sums = to.data_ptr() if by_camera else None
-        _call(native, cameras, count, call, tile)
+        _call(native, cameras, count, call, to if by_camera else None, tile)
     return by_points.movedim(0, 2), sums.movedim(0, 2)
 
 
@@ -111,12 +108,12 @@ def _vjp(
     results = _empty((cameras, count, size), native.dtype) if size else None
     tiles, sums = -(-count // _TILE_POINTS), None
     if want_parameters:
-        sums = torch.zeros(cameras, tiles, 4 + native.plan.parameters, dtype=torch.float64, device="cpu")
+        sums = torch.empty(cameras, tiles, 4 + native.plan.parameters, dtype=torch.float64, device="cpu")
     if results is not None:
         call.results, call.result_strides[:] = results.data_ptr(), results.stride()
     component, *row = cotangents.stride()
-    call.cotangents, call.cotangent_strides[:], call.sums = cotangents.data_ptr(), (*row, component), address(sums)
-    _call(native, cameras, count, call)
+    call.cotangents, call.cotangent_strides[:] = cotangents.data_ptr(), (*row, component)
+    _call(native, cameras, count, call, sums)
     return results, None if sums is None else sums.sum(1).to(native.dtype)
 
 
@@ -261,12 +258,7 @@ def run_and_follow(
     threads = min(thread_count(), tiles) if tiles > 1 else 1
     while True:
         counters[:] = [0, 0]
-        if threads == 1:
-            flags = run(call)
-        else:
-            left: list[int] = []
-            spread(lambda: left.append(run(call)), threads)  # noqa: B023 (called at once)
-            flags = functools.reduce(operator.or_, left)
+        flags = run(call) if threads == 1 else run_in_threads(run, call, threads)
         if not flags & (structs.LEFT_FROM | structs.LEFT_TO):
             return flags
         follow(flags, start, end)
@@ -313,16 +305,34 @@ def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
     return torch.empty(size, dtype=dtype, device="cpu")
 
 
-def _call(native: Native, cameras: int, count: int, call: structs.Rows, tile: int = _TILE_POINTS) -> int:
-    """Call the native geometry with rows, their results and the other arguments of `Rows`."""
+def _call(
+    native: Native, cameras: int, count: int, call: structs.Rows, sums: Tensor | None = None, tile: int = _TILE_POINTS
+) -> None:
+    """Call the native geometry with rows, their results and the other arguments of `Rows`.
+
+    It adds to `sums`, which begin at zero. The call is repeated if points lie so far out that limits of azimuths
+    decide, which were not followed yet.
+    """
     if cameras != native.cameras:  # C would read elsewhere
         raise ValueError(f"rows must be of {native.cameras} cameras; got those of {cameras}")
     call.cameras, call.count, call.tile = native.pointer, count, tile
-    run, points = loaded().camtorch_geometry, cameras * count
-    if points < _SHARED_POINTS:
-        return run(call) if points else 0
-    following = c_int64(0)
-    call.next = addressof(following)
+    call.sums = None if sums is None else sums.data_ptr()
+    run, points, following = loaded().camtorch_geometry, cameras * count, c_int64(0)
+    threads = 1 if points < _SHARED_POINTS else min(thread_count(), -(-count // _TILE_POINTS) * cameras)
+    if threads > 1:
+        call.next = addressof(following)
+    while True:
+        if sums is not None:
+            sums.zero_()
+        left = run_in_threads(run, call, threads) if threads > 1 else run(call) if points else 0
+        if not left:
+            return
+        native.follow()
+        following.value = 0
+
+
+def run_in_threads(run: Callable[[_Call], int], call: _Call, threads: int) -> int:
+    """Return the flags of all threads that run a call; each takes tiles until none is left."""
     left: list[int] = []
-    spread(lambda: left.append(run(call)), min(thread_count(), -(-count // _TILE_POINTS) * cameras))
-    return sum(left)
+    spread(lambda: left.append(run(call)), threads)
+    return functools.reduce(operator.or_, left)

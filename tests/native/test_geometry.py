@@ -5,7 +5,20 @@ from unittest.mock import patch
 
 import pytest
 import torch
-from cameras import KEYS, constants, every_model, fan, make, one, pixel_lattice, real, slow_unless, spread
+from cameras import (
+    KEYS,
+    constants,
+    every_model,
+    fan,
+    limits_of,
+    make,
+    nodes_of_steps,
+    one,
+    pixel_lattice,
+    real,
+    slow_unless,
+    spread,
+)
 
 import camtorch as ct
 from camtorch.native.build import VARIANTS
@@ -187,6 +200,40 @@ def test_derivatives_are_those_of_the_formula(key, dtype):
             found += [of_coefficients(camera, sums[0, 4:])] if camera.distortion.numel() else []
             for have, want in zip(found, expected, strict=True):
                 close(have, want, loss)
+
+
+@pytest.mark.parametrize("key", slow_unless({"brown_conrady", "fisheye624"}.__contains__, sorted(CODED)))
+def test_derivatives_of_far_points_need_no_call_before(key):
+    """Up to the fold and behind the camera, of so many lenses that none of them is kept."""
+    model, names = ct.MODELS[key], one(key).distortion_names
+    generator = torch.Generator().manual_seed(0)
+    low, high = torch.tensor([limits_of(key, name, wild=True) for name in names] or [(0, 0)]).double().unbind(-1)
+    count = 520 // len(low) + 1  # more than 512 numbers
+    wild = low + torch.rand(count, len(low), generator=generator, dtype=torch.float64) * (high - low)
+    k = torch.stack([nodes_of_steps(key, row) for row in wild])[:, : len(names)]
+    intrinsics = torch.tensor([[300.0, 310, 320, 240]], dtype=torch.float64).expand(count, 4).contiguous()
+    rays = fan(178, 30, 13)
+    rays = rays[rays @ rays.new_tensor([2, 1, 0]) > 0].expand(count, -1, -1)  # on one side, so that sums do not cancel
+    before = CameraRows(model, intrinsics, k).native
+    if before is None:
+        pytest.skip("its parts have no codes of C, which are optional")
+    seen = geometry.project(before, rays)[1]
+    leaves = torch.where(seen[..., None], rays, rays.new_tensor([0, 0, 1])), intrinsics, k
+    here, *numbers = [leaf.requires_grad_() for leaf in leaves]
+    chart, lens = model.optics(columns(k))
+    sensor = torch.stack(lens(*chart.to_plane(*here.unbind(-1))), -1)
+    planes = (sensor * intrinsics[:, None, :2] + intrinsics[:, None, 2:]).unbind(-1)
+    expected = [torch.autograd.grad(plane.sum(), leaves, retain_graph=True, materialize_grads=True) for plane in planes]
+    made = CameraRows(model, *(number.detach() for number in numbers)).native
+    found = geometry.project_jacobians(made, here.detach(), by_camera=True)
+    if key in ("brown_conrady", "splined"):
+        assert made.struct.limits2 is not None  # some points lay so far out
+    for i, (by_points, by_intrinsics, by_k) in enumerate(expected):
+        close(found[0][:, :, i], by_points, 4096)
+        sums = found[1][:, :, i].sum(1)
+        close(sums[:, :4], by_intrinsics, 4096)
+        if names and made.plan.places is not None:
+            close(sums[:, 4:], by_k[:, made.plan.places], 4096)
 
 
 @every_model
