@@ -27,7 +27,7 @@ from camtorch.native import structs
 from camtorch.native.library import loaded
 from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.projection.evaluation import camera_rows
-from camtorch.projection.native_cameras import Lenses, Native, address, lenses_of, native_of
+from camtorch.projection.native_cameras import Native, NativeLenses, lenses_of, native_of
 from camtorch.projection.rows import CameraRows
 from camtorch.rays.lattices import defined_or
 from camtorch.values.arguments import present
@@ -266,7 +266,7 @@ class _BaseLens:
             return None
         return Native(self._native.plan, call.made, partial(self._lenses, call, room, k))
 
-    def _lenses(self, call: structs.Draws, room: object, k: np.ndarray[Any, Any]) -> Lenses:
+    def _lenses(self, call: structs.Draws, room: object, k: np.ndarray[Any, Any]) -> NativeLenses:
         """Return the lenses of new cameras, which hold this function: it keeps the memory of their struct alive."""
         return self._native.lenses
 
@@ -302,14 +302,14 @@ class _NewLens(_BaseLens):
             call.made.limits2 = call.made.extent = None
         return Native(self._native.plan, call.made, partial(self._lenses, call, room, k))
 
-    def _lenses(self, call: structs.Draws, room: object, k: np.ndarray[Any, Any]) -> Lenses:
+    def _lenses(self, call: structs.Draws, room: object, k: np.ndarray[Any, Any]) -> NativeLenses:
         """Return the lenses of new cameras, kept for later ones of the same coefficients."""
         plan, coefficients = self._native.plan, torch.from_numpy(k.reshape(call.cameras, call.count))
 
-        def new() -> Lenses:
+        def new() -> NativeLenses:
             struct = structs.Cameras.from_buffer_copy(call.made)
             struct.hold((call, room, self._native))
-            return Lenses(plan, model_of(self._base).optics, coefficients, struct)
+            return NativeLenses(plan, model_of(self._base).optics, coefficients, struct)
 
         return lenses_of(plan, coefficients, new)
 
@@ -337,7 +337,8 @@ class _ChosenLens(_BaseLens):
         lenses = CameraRows(model_of(self._base), tried.new_ones(len(tried), 4), tried)
         candidates = present(lenses.native, "compiled code for lenses like the base")
         candidates.add_table()
-        call.tries, call.tried, call.allowed = candidates.pointer, tried.data_ptr(), address(allowed)
+        call.tries, call.tried = candidates.pointer, tried.data_ptr()
+        call.allowed = None if allowed is None else allowed.data_ptr()
         call.hold((tried, allowed, candidates))
         return candidates.follow
 
@@ -348,4 +349,4 @@ class _ChosenLens(_BaseLens):
         if intrinsics.ndim > 1:
             return None
         numbers_of_one = torch.from_numpy(intrinsics)[None], torch.from_numpy(k)[None]
-        return native_of(model_of(self._base).optics, *numbers_of_one, None, tables=True)
+        return native_of(model_of(self._base).optics, *numbers_of_one, None)

@@ -464,11 +464,10 @@ def pixel_jacobians(camera: Camera, points: Tensor, learns: bool = True) -> tupl
         by_point, by_own = (
             t.nan_to_num(0.0, 0.0, 0.0) for t in native_calls.project_jacobians(made[0][0], points, learns)
         )
-        if not learns or plan.places is None or plan.is_all:
+        if not learns:
             return by_point, by_own
-        by_parameters = by_own.new_zeros(*by_own.shape[:-1], 4 + camera.distortion.shape[-1])
-        by_parameters[..., :4], by_parameters[..., 4 + plan.places] = by_own[..., :4], by_own[..., 4:]
-        return by_point, by_parameters
+        by_k = plan.by_coefficients(by_own[..., 4:], camera.distortion.shape[-1])
+        return by_point, torch.cat((by_own[..., :4], by_k), -1)
     intrinsics = camera.intrinsics.view(-1, 4)
     found = sensor_jacobians(camera, camera.distortion.view(len(intrinsics), -1), points, math.inf)
     focal = intrinsics[:, None, :2, None]

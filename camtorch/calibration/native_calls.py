@@ -111,7 +111,7 @@ def project_views(
     valid = torch.empty(weights.shape, dtype=torch.bool, device="cpu")
     residuals, weighed, cost = (t.new_empty(t.shape) for t in (pixels, weights, weights[..., 0]))
     wanted = learnt or ()
-    if plan.places is not None and not plan.is_all:  # the place of each coefficient among the camera's parameters
+    if plan.places is not None:  # the place of each coefficient among the camera's parameters
         at = {4 + place: 4 + i for i, place in enumerate(plan.places.tolist())}
         wanted = [at.get(number, number) for number in wanted]
     count = 0 if learnt is None else len(points)

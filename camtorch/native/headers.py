@@ -29,7 +29,7 @@ from collections.abc import Callable
 from ctypes import c_double, c_int32, c_int64, c_void_p
 from typing import Annotated
 
-from camtorch.native.structure import Calls, Double, Int32, Int64, Numbers, Pointer, Struct, Text, Unsigned, Void
+from camtorch.native.structure import Double, Int32, Int64, Numbers, Pointer, Struct, Text, TypedLibrary, Unsigned, Void
 '''
 
 
@@ -117,7 +117,7 @@ def structs_py(folder: Path = _HERE) -> str:
             hint = f"Annotated[Numbers, {in_c} * {many}]" if many else one
             lines.append(f"    {name}{'_' * keyword.iskeyword(name)}: {hint}")
     lines += ["", "", f"STRUCTS = {', '.join(found.structs)}", "for struct in STRUCTS:", "    struct.lay_out()"]
-    lines += ["", "", "class Library(Calls):", '    """The compiled library."""', ""]
+    lines += ["", "", "class Library(TypedLibrary):", '    """The compiled library."""', ""]
     for name, (result, given) in found.calls.items():
         takes = ", ".join(one[:-1] if one[:-1] in found.structs else _GIVEN[one] for one in given)
         lines.append(f"    {name}: Callable[[{takes}], {_RESULTS[result]}]")

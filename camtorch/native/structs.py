@@ -4,7 +4,7 @@ from collections.abc import Callable
 from ctypes import c_double, c_int32, c_int64, c_void_p
 from typing import Annotated
 
-from camtorch.native.structure import Calls, Double, Int32, Int64, Numbers, Pointer, Struct, Text, Unsigned, Void
+from camtorch.native.structure import Double, Int32, Int64, Numbers, Pointer, Struct, Text, TypedLibrary, Unsigned, Void
 
 CHECKSUM = 2330108966
 
@@ -410,7 +410,7 @@ for struct in STRUCTS:
     struct.lay_out()
 
 
-class Library(Calls):
+class Library(TypedLibrary):
     """The compiled library."""
 
     camtorch_sample: Callable[[Job], Int32]

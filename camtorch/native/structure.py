@@ -51,7 +51,7 @@ class Struct(ctypes.Structure):
             kept.append(owner)
 
 
-class Calls(ctypes.CDLL):
+class TypedLibrary(ctypes.CDLL):
     """A library whose calls refuse other structures than their own, after `declare`."""
 
     def declare(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
@@ -58,7 +58,12 @@ class Domain:
     """
 
     def __init__(
-        self, optics: Optics, k: Tensor, known: Mapping[str, Any] = MappingProxyType({}), *, is_constant: bool = False
+        self,
+        optics: Optics,
+        k: Tensor,
+        known: Mapping[str, object] = MappingProxyType({}),
+        *,
+        is_constant: bool = False,
     ):
         """Make the domain of a model's `optics` and coefficients (C, n), of the points' dtype and device.
 

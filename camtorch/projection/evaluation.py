@@ -70,11 +70,7 @@ def evaluate_rows(
     intrinsics, distortion = per_row(tensors, lead, rows)
     way = way_of(model.__name__, rows, intrinsics, distortion)
     if constant is not None and not way.is_native and is_constant(constant) and all(type(side) is int for side in lead):
-        with with_values(constant):
-            intrinsics, distortion = per_row(constant.tensors, lead, rows)
-            cameras = cameras_of(intrinsics, distortion).as_constant()
-        with portable_export():
-            return direction.formula(model, rows, intrinsics, distortion, cameras)
+        return _exported(model, direction, rows, lead, cameras_of, constant)
     known = cameras_of(intrinsics, distortion) if way.is_known else None
     native = known.native if known is not None and way.is_native else None
     if native is not None and way.learns:
@@ -90,14 +86,35 @@ def evaluate_rows(
     few = known is None or rows.shape[0] * rows.shape[1] <= _BLOCK_POINTS
     if few or not are_free(rows, intrinsics, distortion):
         return direction.formula(model, rows, intrinsics, distortion, known)
-    # block by block, which stay in a cache from one operation to the next
+    return _by_blocks(lambda block: direction.formula(model, block, intrinsics, distortion, known), rows, direction)
+
+
+def _exported(
+    model: type[CameraLike],
+    direction: Direction,
+    rows: Tensor,
+    lead: torch.Size,
+    cameras_of: Callable[[Tensor, Tensor], CameraRows],
+    constant: CameraLike,
+) -> tuple[Tensor, Tensor]:
+    """Return the results of `evaluate_rows` as an exported program has them, which holds the camera as a constant."""
+    with with_values(constant):
+        intrinsics, distortion = per_row(constant.tensors, lead, rows)
+        cameras = cameras_of(intrinsics, distortion).as_constant()
+    with portable_export():
+        return direction.formula(model, rows, intrinsics, distortion, cameras)
+
+
+def _by_blocks(
+    evaluate: Callable[[Tensor], tuple[Tensor, Tensor]], rows: Tensor, direction: Direction
+) -> tuple[Tensor, Tensor]:
+    """Return the results of blocks of rows (C, N, size), which stay in a cache from one operation to the next."""
     planes = rows.new_empty(direction.size_out, *rows.shape[:2])
     valid = torch.empty(planes.shape[1:], dtype=torch.bool, device=planes.device)
     step = max(_BLOCK_POINTS * torch.get_num_threads() // len(rows), 1)
     for start in range(0, rows.shape[1], step):
         block = slice(start, start + step)
-        results = direction.formula(model, rows[:, block], intrinsics, distortion, known)
-        planes[..., block], valid[..., block] = results
+        planes[..., block], valid[..., block] = evaluate(rows[:, block])
     return planes, valid
 
 

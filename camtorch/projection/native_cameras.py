@@ -1,7 +1,8 @@
 """Cameras of one model in the form of the native geometry: codes of their parts, numbers, and tables.
 
-`native_of` makes a `Native` of three layers: a `ModelPlan` that all cameras of a model share, `Lenses` that all cameras
-of the same coefficients share, and intrinsics. C reads structs of addresses, and each struct keeps their memory alive.
+`native_of` makes a `Native` of three layers: a `ModelPlan` that all cameras of a model share, `NativeLenses` that all
+cameras of the same coefficients share, and intrinsics. C reads structs of addresses: the struct X belongs to a class
+`NativeX`, which keeps alive what it points to, as `NativeMove`; that of `Native` and of its lenses is `Cameras`.
 A part is a chart or a stage; `parameters` are what parts compute with: coefficients, or numbers made of them.
 """
 
@@ -23,7 +24,7 @@ from camtorch.native.library import library, loaded
 from camtorch.optics.backprojection import FURTHEST
 from camtorch.optics.radial_inverse import TABLE_WIDTH
 from camtorch.projection.domain import Domain
-from camtorch.values.arguments import columns
+from camtorch.values.arguments import columns, present
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,7 +47,7 @@ class ModelPlan:
         index = {id(c): i for i, c in enumerate(coefficients)}
         known = [index[id(p)] for p in parameters if id(p) in index]
         self.places = torch.tensor(known, device="cpu") if len(known) == len(parameters) else None
-        self.is_all = known == list(range(len(coefficients)))
+        self._is_all = known == list(range(len(coefficients)))
         self.chart_is_inverted = isinstance(chart, optics.Inverted)
         self.has_stages, self.is_radial = bool(lens.stages), lens.is_radial
         self.has_factor, self.has_rest = lens.radial is not None, lens.rest is not None
@@ -55,7 +56,7 @@ class ModelPlan:
         self.fixed_ends: dict[torch.dtype, tuple[float, float]] = {}  # if all cameras have them, after a call of `ends`
         self._radii: dict[tuple[torch.dtype, int], Tensor] = {}
 
-    def ends(self, lenses: Lenses) -> tuple[float | Tensor, float | Tensor]:
+    def ends(self, lenses: NativeLenses) -> tuple[float | Tensor, float | Tensor]:
         """Return the radii at which the chart of some lenses ends, and beyond which there are no images."""
         if self.chart_is_inverted:
             return FURTHEST, FURTHEST
@@ -68,7 +69,7 @@ class ModelPlan:
             self.fixed_ends[dtype] = end, usual_end
         return end, usual_end
 
-    def radii(self, lenses: Lenses, count: int, dtype: torch.dtype) -> Tensor:
+    def radii(self, lenses: NativeLenses, count: int, dtype: torch.dtype) -> Tensor:
         """Return the radii of the chart of some lenses, like `Chart.radii`, in double precision."""
         key = dtype, count
         if key in self._radii:
@@ -82,15 +83,22 @@ class ModelPlan:
     def parameters_of(self, optics_of: Optics, k: Tensor) -> Tensor:
         """Return the parameters (C, parameters) for coefficients (C, n)."""
         if self.places is not None:
-            return k if self.is_all else k.index_select(1, self.places)
+            return k if self._is_all else k.index_select(1, self.places)
         chart, lens = optics_of(columns(k))
         return torch.cat([c.expand(len(k), 1) for c in (*chart.parameters, *lens.parameters)], -1)
+
+    def by_coefficients(self, by_parameters: Tensor, count: int) -> Tensor:
+        """Return derivatives (..., count) by coefficients for those by parameters, which are some of them."""
+        if self._is_all:
+            return by_parameters
+        zeros = by_parameters.new_zeros(*by_parameters.shape[:-1], count)
+        return zeros.index_add_(-1, present(self.places, "parameters that are coefficients"), by_parameters)
 
 
 _plans = Kept(64)  # keyed by optics and number of coefficients
 
 
-class Lenses:
+class NativeLenses:
     """The lenses of cameras (C,) in the form of the native geometry: numbers, and their domains as far as known."""
 
     def __init__(self, plan: ModelPlan, optics_of: Optics, k: Tensor, struct: structs.Cameras):
@@ -98,8 +106,8 @@ class Lenses:
         self.plan, self.optics_of, self.k, self.struct = plan, optics_of, k, struct
 
     @classmethod
-    def of(cls, plan: ModelPlan, optics_of: Optics, k: Tensor, tables: bool) -> Lenses:
-        """Return the lenses of coefficients (C, n) with their domains, and the table for the inverse if `tables`."""
+    def of(cls, plan: ModelPlan, optics_of: Optics, k: Tensor) -> NativeLenses:
+        """Return the lenses of coefficients (C, n) with their domains."""
         struct = structs.Cameras(cameras=len(k), is_double=k.dtype == torch.float64)
         struct.hold(k)
         struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
@@ -112,7 +120,7 @@ class Lenses:
         if plan.chart_is_inverted:
             lenses._add_chart()
         if plan.has_stages:
-            lenses._add_domain(tables)
+            lenses._add_domain()
         return lenses
 
     @cached_property
@@ -158,8 +166,8 @@ class Lenses:
         self._fill({"safe_radius_sq": struct.chart_safe_radius_sq, "table": struct.chart_table, "is_chart": True})
         struct.chart_most2 = self._keep(table[:, 1])
 
-    def _add_domain(self, tables: bool) -> None:
-        """Set how far out the lenses are one-to-one, and the table for their inverse if `tables`."""
+    def _add_domain(self) -> None:
+        """Set how far out the lenses are one-to-one."""
         plan, struct = self.plan, self.struct
         if plan.chart_is_inverted:  # its end comes from a search, which C lacks
             domain = Domain(self.optics_of, self.k)
@@ -170,11 +178,8 @@ class Lenses:
         names = ["safe_radius_sq", "image_radius_sq"]
         if plan.has_rest:
             names += ["image_circle_sq", "stagewise"]
-        width = len(names)
-        if tables and plan.has_factor:
-            names, width = [*names, "table"], width + TABLE_WIDTH
-        # in one piece of memory: a column each, and last the table
-        start, step = self._new(width), struct.cameras * self.k.dtype.itemsize
+        # in one piece of memory: a column each
+        start, step = self._new(len(names)), struct.cameras * self.k.dtype.itemsize
         made = {name: start + step * i for i, name in enumerate(names)}
         inputs = {} if plan.is_radial else {"radii": self._keep(plan.radii(self, structs.MOST_RADII, self.k.dtype))}
         self._fill(made | inputs)
@@ -243,7 +248,7 @@ _MOST_COEFFICIENTS = 512  # of lenses that are kept
 _lenses = Kept(24)
 
 
-def lenses_of(plan: ModelPlan, k: Tensor, make: Callable[[], Lenses]) -> Lenses:
+def lenses_of(plan: ModelPlan, k: Tensor, make: Callable[[], NativeLenses]) -> NativeLenses:
     """Return the lenses of coefficients (C, n): one of the last ones used, or new ones."""
     if k.numel() > _MOST_COEFFICIENTS:
         return make()
@@ -253,7 +258,7 @@ def lenses_of(plan: ModelPlan, k: Tensor, make: Callable[[], Lenses]) -> Lenses:
 class Native:
     """Cameras (C,) of one model in the form of the native geometry."""
 
-    def __init__(self, plan: ModelPlan, struct: structs.Cameras, lenses: Callable[[], Lenses]):
+    def __init__(self, plan: ModelPlan, struct: structs.Cameras, lenses: Callable[[], NativeLenses]):
         """Take the cameras' struct and a function for their lenses, which keep alive what the struct points to."""
         self.plan, self.struct, self.pointer, self._find_lenses = plan, struct, addressof(struct), lenses
         self.cameras, self.dtype = struct.cameras, torch.float64 if struct.is_double else torch.float32
@@ -263,7 +268,7 @@ class Native:
         return self
 
     @cached_property
-    def lenses(self) -> Lenses:
+    def lenses(self) -> NativeLenses:
         """The lenses of the cameras, which other cameras may share."""
         return self._find_lenses()
 
@@ -281,13 +286,11 @@ class Native:
         self.struct.limits2, self.struct.extent = self.lenses.followed()
 
 
-def native_of(
-    optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None, tables: bool = False
-) -> Native | None:
+def native_of(optics_of: Optics, intrinsics: Tensor, k: Tensor, usable: Tensor | None) -> Native | None:
     """Return cameras of intrinsics (C, 4) and coefficients (C, n) in the form of the native geometry.
 
     None without a library, on another device, and if a part of the optics has no code: a user's own. usable: (C, 1),
-    None if all are. tables: Whether to make the table for the inverse now, as pixels are sure to follow.
+    None if all are.
     """
     if library() is None or not intrinsics.is_cpu or not k.shape[0]:
         return None
@@ -301,7 +304,7 @@ def native_of(
     plan = _plans((), (optics_of, k.shape[-1]), planned)
     if plan is None:
         return None
-    lenses = lenses_of(plan, k, lambda: Lenses.of(plan, optics_of, k, tables))
+    lenses = lenses_of(plan, k, lambda: NativeLenses.of(plan, optics_of, k))
     struct = structs.Cameras.from_buffer_copy(lenses.struct)
     struct.intrinsics = struct.keep(intrinsics.contiguous())
     struct.usable = None if usable is None else struct.keep((usable > 0).contiguous())
@@ -369,8 +372,3 @@ def _stage(stage: Stage) -> structs.Part | None:
 def _constants(lens: Lens) -> Sequence[Tensor]:
     radial = lens.radial
     return (*radial.nodes, radial.end) if isinstance(radial, optics.RadiusTable) else ()
-
-
-def address(tensor: Tensor | None) -> int:
-    """Return the address of a tensor's values, 0 for None."""
-    return 0 if tensor is None else tensor.data_ptr()

@@ -17,7 +17,7 @@ from camtorch.projection.solve import search
 from camtorch.values.arguments import columns
 
 
-def recorded_tables(model: type[CameraLike], k: Tensor) -> dict[str, Any]:
+def recorded_tables(model: type[CameraLike], k: Tensor) -> dict[str, object]:
     """Return the properties of a `Domain` that a graph needs, in which no value may be read to choose an inverse."""
     chart, lens = model.optics(columns(k))
     if not lens.stages:

@@ -10,7 +10,7 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -63,7 +63,7 @@ class CameraRows:
         if native is not None:  # its tables are known on the CPU
             tables = native.lenses.tables()
             there = sent([*tables.values()], self.k.device) if tables else ()  # nothing is a transfer, too
-            known: dict[str, Any] = dict(zip(tables, there, strict=True))
+            known: dict[str, object] = dict(zip(tables, there, strict=True))
             known["inverse_by"] = way_of_inverse(native.plan.is_radial, tables.get("stagewise"))
             return Domain(self.model.optics, self.k, known)
         if self._learns:  # and so will not be used again
@@ -91,7 +91,7 @@ class CameraRows:
         sums = sums[:, 4:]
         plan = present(self.native, "compiled code, which gave the sums,").plan
         if plan.places is not None:
-            return of_intrinsics, sums if plan.is_all else torch.zeros_like(self.k).index_add_(1, plan.places, sums)
+            return of_intrinsics, plan.by_coefficients(sums, self.k.shape[1])
         # the model computes parameters from coefficients: torch differentiates that
         with torch.enable_grad():
             k = self.k.detach().requires_grad_()
@@ -102,11 +102,11 @@ class CameraRows:
         return of_intrinsics, by_coefficients
 
 
-def _constant_tables(domain: Domain) -> dict[str, Any]:
+def _constant_tables(domain: Domain) -> dict[str, object]:
     """Return the properties of a domain whose values are known, as far as a graph may need them; none is a view."""
     if not domain.lens.stages:
         return {}
-    names, known = ["safe_radius_sq"], dict[str, Any]()
+    names, known = ["safe_radius_sq"], dict[str, object]()
     if domain.inverse_by in ("stages", "either"):
         names += ["image_circle_sq", "stagewise"]
     if not domain.is_circular:

@@ -3,7 +3,7 @@
 A lens sends (a, b), of the chart's plane, to (u, v): its first stage to (p, q), and the later stages that to (u, v).
 Each point has a `camera`, an index. `search` goes one of three ways, see `domain.InverseBy`: along the radius and by
 stages the domain is a circle, and the solution is bracketed; in the plane, secants find a start for damped steps. Then
-`_Lenses.checked` removes what rounding left, and asks where the solution's ray is seen.
+`_PointSearch.checked` removes what rounding left, and asks where the solution's ray is seen.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def _of_chosen(
 
 def _along_radius(domain: Domain, camera: Tensor, u: Tensor, v: Tensor, p: Tensor, q: Tensor) -> Searched:
     """Search for the point that the first stage, a radial one, sends to (p, q), and the whole lens to (u, v)."""
-    lenses = _Lenses(domain, camera, is_circle=True)
-    return lenses.checked(*lenses.bracket(p, q), u, v)
+    points = _PointSearch(domain, camera, is_circle=True)
+    return points.checked(*points.bracket(p, q), u, v)
 
 
 def _by_stages(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Searched:
@@ -95,21 +95,21 @@ def _in_plane(domain: Domain, camera: Tensor, u: Tensor, v: Tensor) -> Searched:
 
 def _by_damped_steps(domain: Domain, camera: Tensor, u: Tensor, v: Tensor, within: Tensor) -> Searched:
     """Search by Newton's method; the few points that need many steps go on alone."""
-    lenses = _Lenses(domain, camera, is_circle=False)
-    start = lenses.start(u, v, within)
+    points = _PointSearch(domain, camera, is_circle=False)
+    start = points.start(u, v, within)
     if domain.is_constant:
-        a, b, _ = lenses.newton(u, v, *start, within, _FIRST_STEPS + _LATE_STEPS)
-        return lenses.checked(a, b, u, v)
-    a, b, moves = lenses.newton(u, v, *start, within, _FIRST_STEPS)
+        a, b, _ = points.newton(u, v, *start, within, _FIRST_STEPS + _LATE_STEPS)
+        return points.checked(a, b, u, v)
+    a, b, moves = points.newton(u, v, *start, within, _FIRST_STEPS)
     (late,) = moves.nonzero(as_tuple=True)
     if len(late):
-        alone = _Lenses(domain, camera[late], is_circle=False)
+        alone = _PointSearch(domain, camera[late], is_circle=False)
         a[late], b[late], _ = alone.newton(u[late], v[late], a[late], b[late], within[late], _LATE_STEPS)
-    return lenses.checked(a, b, u, v)
+    return points.checked(a, b, u, v)
 
 
-class _Lenses:
-    """The lenses through which cameras see single points (M,), and the steps of their inverse."""
+class _PointSearch:
+    """The steps of the search for single points (M,), each through the lens of its camera."""
 
     def __init__(self, domain: Domain, camera: Tensor, *, is_circle: bool):
         """Take the domain of the cameras, which for these points `is_circle` or not."""
@@ -166,11 +166,11 @@ class _Lenses:
         3.3), that the next step by the same Jacobian is shorter. If a lens stretches one direction far more than the
         other, the residual itself would reject every good step.
         """
-        enough = rounding(u, v) / 8
+        settled = rounding(u, v) / 8
 
         def would_move(x: Tensor, y: Tensor, part: Tensor) -> Tensor:
             miss = torch.maximum((u - x).abs(), (v - y).abs())
-            return within & (miss > enough) & (part > _LEAST_PART)
+            return within & (miss > settled) & (part > _LEAST_PART)
 
         def step(moves: Tensor, part: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
             a, b, x, y, ua, ub, va, vb = state

@@ -16,8 +16,8 @@ from camtorch.evaluate.kept import Kept
 from camtorch.native import memory, structs
 from camtorch.native.library import loaded
 from camtorch.native.sampler import describe, is_quick, maker, takes, tiles_of
-from camtorch.projection.native_calls import Lattices, NativeMove, follow, run_and_follow
 from camtorch.projection.native_cameras import Native
+from camtorch.projection.native_moves import NativeLattices, NativeMove, follow, run_and_follow
 from camtorch.values.threads import spread, thread_count
 from camtorch.warp.lattice import FEWEST_CELLS, MOST_KEPT_NODES, coarse, probes
 from camtorch.warp.options import Options, Sampler, serving_all
@@ -176,12 +176,14 @@ class SampleCall:
         self._tiles = tiles_of(sizes[1])  # of an image, which threads share
         self._is_small = self._tiles <= _TILES_FOR_ONE_THREAD or not self._images_of_call  # one thread makes all
 
-    def _lattices_of(self, samplers: Iterable[Sampler], tolerance: float) -> Lattices:
+    def _lattices_of(self, samplers: Iterable[Sampler], tolerance: float) -> NativeLattices:
         """Return the lattices by which all images are sampled, of which C has the struct."""
         padding = serving_all("zeros", *(how.padding_mode for how in samplers))
+        back = structs.Move()
+        back.turn_strides[:] = 0, 1, 3  # which transpose rotations
         with torch.inference_mode(False):
             nodes = probes(0, self._sizes[1], self._dtype)
-            made = Lattices(nodes, self._sizes[1], self._sizes[0], tolerance, padding, self._count)
+            made = NativeLattices(back, nodes, self._sizes[1], self._sizes[0], tolerance, padding, self._count)
         self._call.lattices = made.struct
         return made
 

@@ -11,7 +11,7 @@ from camtorch.cameras.camera import Camera
 from camtorch.native.structs import ON_IMAGE, PIXELS
 from camtorch.poses.rotations import transposed, turn
 from camtorch.projection.evaluation import native_forms
-from camtorch.projection.native_calls import NativeMove
+from camtorch.projection.native_moves import NativeMove
 from camtorch.values.arguments import Numbers
 from camtorch.warp.lattice import to_positions
 from camtorch.warp.panorama import goes_round, off_poles, within_turn
