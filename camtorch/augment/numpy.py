@@ -144,7 +144,8 @@ class Transform(FrontEnd):
         if kind is None and name.endswith(_VALID):
             name = name.removesuffix(_VALID)
             kind = kind_of(name, sample.get(name), self.augmentation.fields, _OWNER, single=True)
-            kind = kind if kind not in IMAGES or np.ndim(value) > 1 else None  # a flag for each sample
+            if kind in IMAGES and np.ndim(value) <= 1:  # a flag for each sample
+                return None
         return kind
 
     def _ways(self, sample: Sample, camera: Any) -> dict[str, Way]:
@@ -253,12 +254,19 @@ def _form_of(sample: Sample) -> tuple[Any, ...] | None:
     return tuple(parts)
 
 
+def shaped_if_empty(array: Any, kind: str | None) -> Any:
+    """Return an array; one without numbers in the shape of no values of a kind, as (0, 2) for keypoints."""
+    if array.size or kind is None or not KINDS[kind].ends:
+        return array
+    rows = max(KINDS[kind].dims - 1, 1)
+    return array.reshape(*(0,) * rows, KINDS[kind].ends[0][-1])
+
+
 def _numbers(value: Any, name: str, kind: str | None) -> Any:
     """Return coordinates as floating point, flags as bool, and a list of numbers as an array."""
     if kind is None or name.endswith(_VALID):
         return np.asarray(value, bool if name.endswith(_VALID) else None)
     if isinstance(value, (list, tuple)):
         with contextlib.suppress(TypeError, ValueError):
-            value = np.asarray(value, np.float32)
-            value = value.reshape(0, KINDS[kind].ends[0][-1]) if not value.size and KINDS[kind].ends else value
+            value = shaped_if_empty(np.asarray(value, np.float32), kind)
     return value.astype(np.float32) if isinstance(value, np.ndarray) and value.dtype.kind in "iub" else value

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.fields import IMAGES, KEEP, KINDS
+from camtorch.augment.fields import IMAGES, KEEP
 from camtorch.augment.names import kind_of
-from camtorch.augment.numpy import Transform
+from camtorch.augment.numpy import Transform, shaped_if_empty
 from camtorch.augment.part import Part
 from camtorch.augment.sample import Sample
 from camtorch.cameras.camera import Camera
@@ -107,9 +107,7 @@ def _dense(name: str, value: Any, kind: str | None = None) -> Any:
             array = np.asarray(value, bool if name.endswith("_valid") else np.float64)
         except (ValueError, TypeError, OverflowError):
             raise ValueError(f"{name} must be numbers in lists of one length; got {value!r:.80}") from None
-        if array.size or kind not in KINDS:
-            return array
-        return array.reshape(*[0] * (KINDS[kind].dims - 1), *(end[-1] for end in KINDS[kind].ends[:1]))
+        return shaped_if_empty(array, kind)
     if isinstance(value, np.ndarray) and value.dtype == object:
         parts = [_dense(name, part) for part in value]
         if parts and all(isinstance(part, np.ndarray) and part.shape == parts[0].shape for part in parts):

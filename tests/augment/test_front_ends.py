@@ -72,6 +72,16 @@ def test_layouts_lists_and_what_was_valid_before():
     assert (empty.shape, empty.dtype) == ((0, 20, 30), np.uint8)
 
 
+@pytest.mark.parametrize("name", ["keypoints", "polygons", "boxes", "gaze", "points", "pitch_yaw"])
+def test_an_empty_list_is_no_value_of_any_kind(name):
+    transform = ct.augment.numpy.Transform(ct.augment.RandomMount(), camera())
+    image = images()[0]
+    moved = transform({"image": image, name: []})
+    ends = {"polygons": (0, 0, 2), "boxes": (0, 4), "gaze": (0, 3), "points": (0, 3)}
+    assert moved[name].shape == ends.get(name, (0, 2))
+    assert transform.inverse(moved)[name].shape == moved[name].shape
+
+
 def test_there_and_back():
     image, _, points, _ = images()
     transform = ct.augment.numpy.Transform(ct.augment.RandomMount(), camera())

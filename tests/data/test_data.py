@@ -340,5 +340,6 @@ def test_wrong_samples_are_told():
     with pytest.raises(TypeError, match=r"must be a dict of entries, before .to_tuple; got tuple"):
         function(("jpg",))
     function = ct.data.MapSamples(augmentation(), fields={"nose": "keypoints"})
-    empty = function(sample | {"json": {"keypoints": [], "polygons": [], "boxes": None, "nose": []}})
-    assert (empty["json"]["keypoints"], empty["json"]["polygons"], empty["json"]["boxes"]) == ([], [], None)
+    none = {name: [] for name in ("keypoints", "polygons", "gaze", "points", "pitch_yaw")}
+    empty = function(sample | {"json": {**none, "boxes": None, "nose": []}})
+    assert {name: empty["json"][name] for name in (*none, "boxes")} == {**none, "boxes": None}
