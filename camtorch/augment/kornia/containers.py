@@ -74,6 +74,7 @@ def _with_fields(
         return call(container, *args, params=params, data_keys=data_keys)
     ours = _ours_in(container)
     read = _read_dict(container, args[0], ours)
+    _check_dict(container, args[0], read.kinds, ours)
     camera = _camera_of_dict(container, read, ours)
     if camera is not None and not back:
         params = with_cameras(_drawn_before(container, read.image) if params is None else params, camera)
@@ -127,33 +128,32 @@ def _read_dict(container: Any, given: Sample, ours: list[FrontEnd]) -> _Dict:
         kind = None if rest[name] is None else kind_of(name, rest[name], option, owner, is_single)
         if kind is not None:
             kinds[name] = kind
-    has_place, has_camera = (rest.get(name) is not None for name in (PLACE, "camera"))
-    if has_place and "rotation" not in kinds:
-        raise ValueError(
-            f"{owner}: a sample with {PLACE} must have the rotation that came with it, as it follows from that and the "
-            f"camera; got {', '.join(given)}. Leave {PLACE} out, or keep the rotation"
-        )
-    moving = [*kinds, *(["camera"] if has_camera else [])]
-    _check_others(container, [*moving, *(PLACE for one in ours if one.augmentation.place)])
     tables = {name for one in ours if one.augmentation.mirroring for name in one.augmentation.mirroring.by_name}
     changing = kinds.keys() | tables
     fields = {name: rest[name] for name in unmoved if name in changing or name.removesuffix("_valid") in kinds}
-    if has_place:
+    if rest.get(PLACE) is not None:
         fields[PLACE] = rest[PLACE]
     return _Dict(rest, Single(fields) if is_single else fields, kinds, image, given.get("camera"))
 
 
-def _check_others(container: Any, names: list[str]) -> None:
-    """Raise a ValueError if the container holds augmentations of kornia's own that would leave fields unmoved."""
-    for module in container.modules() if names else ():
+def _check_dict(container: Any, given: Sample, kinds: dict[str, str], ours: list[FrontEnd]) -> None:
+    """Raise a ValueError for a crop's place alone, or if augmentations of kornia's own would leave fields unmoved."""
+    owner = type(container).__name__
+    if given.get(PLACE) is not None and "rotation" not in kinds:
+        raise ValueError(
+            f"{owner}: a sample with {PLACE} must have the rotation that came with it, as it follows from that and the "
+            f"camera; got {', '.join(given)}. Leave {PLACE} out, or keep the rotation"
+        )
+    moving = [*kinds, *(["camera"] if given.get("camera") is not None else [])]
+    moving += [PLACE for one in ours if one.augmentation.place]
+    for module in container.modules() if moving else ():
         if not isinstance(module, BasicAugmentationBase) or isinstance(module, (FrontEnd, IntensityAugmentationBase2D)):
             continue
         theirs = type(module).__name__
         ours = next((name for name in (theirs, theirs.removeprefix("Random")) if hasattr(augment, name)), None)
         how = f"camtorch.augment.kornia.{ours}, which moves" if ours else "augmentations of camtorch alone, which move"
         raise ValueError(
-            f"{type(container).__name__}: parts must move {', '.join(names)} too; got kornia's {theirs}. Use {how} "
-            "everything"
+            f"{owner}: parts must move {', '.join(moving)} too; got kornia's {theirs}. Use {how} everything"
         )
 
 
