@@ -183,8 +183,7 @@ class CameraAugmentation(FrontEnd, GeometricAugmentationBase2D):
         """Return the cameras of the images of params, on a device; None: on that of the known camera."""
         camera = self.camera
         if isinstance(camera, Guess):
-            shape = params[KIND][0] if len(params[KIND]) else params["forward_input_shape"]
-            camera = self.camera_for(shape[-2:].tolist())
+            camera = self.camera_for(params["forward_input_shape"][-2:].tolist())
         return camera_with_params(params, camera, device)
 
     @property

@@ -150,8 +150,8 @@ def _check_dict(container: Any, given: Sample, kinds: dict[str, str], ours: list
         if not isinstance(module, BasicAugmentationBase) or isinstance(module, (FrontEnd, IntensityAugmentationBase2D)):
             continue
         theirs = type(module).__name__
-        ours = next((name for name in (theirs, theirs.removeprefix("Random")) if hasattr(augment, name)), None)
-        how = f"camtorch.augment.kornia.{ours}, which moves" if ours else "augmentations of camtorch alone, which move"
+        like = next((name for name in (theirs, theirs.removeprefix("Random")) if hasattr(augment, name)), None)
+        how = f"camtorch.augment.kornia.{like}, which moves" if like else "augmentations of camtorch alone, which move"
         raise ValueError(
             f"{owner}: parts must move {', '.join(moving)} too; got kornia's {theirs}. Use {how} everything"
         )
