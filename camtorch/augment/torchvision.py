@@ -8,7 +8,6 @@ The module is imported by name: `import camtorch.augment.torchvision`.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -122,16 +121,11 @@ class Transform(FrontEnd, v2.Transform):
             if count > 1:
                 raise ValueError(f"{_OWNER}: a sample must have one {name}; got {count}")
         known = leaves[cameras[0]] if cameras else self.camera
-        sizes = []
-        for i, field in fields.items():
-            size = field.value.shape[-2:] if field.kind in IMAGES else getattr(leaves[i], "canvas_size", None)
-            if size is not None:
-                sizes.append((type(leaves[i]).__name__, tuple(size)))
-        matrix = next(((keys[i], field.value) for i, field in fields.items() if field.kind == "K"), None)
-        camera = camera_of_sample(_OWNER, known, augmentation.camera, augmentation.needs_camera, sizes, matrix)
-        is_guessed = matrix is None and isinstance(known_camera(known, augmentation.camera), Guess)
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
-        sample = Frames({keys[i]: field.value for i, field in fields.items()}, camera=detached(camera))
+        camera = detached(self._camera_of(nest, fields, known))
+        sample = Frames({keys[i]: field.value for i, field in fields.items()}, camera=camera)
+        kinds = {keys[i]: field.kind or KEEP for i, field in fields.items()}
+        is_guessed = isinstance(known_camera(known, augmentation.camera), Guess) and "K" not in kinds.values()
         added = [name for name in (PLACE, "rotation") if augmentation.place and name not in sample]
         if is_guessed or (augmentation.place and not cameras):
             added.append("camera")
@@ -151,7 +145,17 @@ class Transform(FrontEnd, v2.Transform):
                     nest.put_flags(i, moved.get(f"{keys[i]}_valid"), result)
             return result
 
-        return sample, {keys[i]: field.kind or KEEP for i, field in fields.items()}, write
+        return sample, kinds, write
+
+    def _camera_of(self, nest: _Nest, fields: Mapping[int, _Leaf], known: Camera | float | None) -> Camera:
+        """Return the camera of a sample's images; known: that of the sample, else of this transform."""
+        own, sizes = self.augmentation, []
+        for i, field in fields.items():
+            size = field.value.shape[-2:] if field.kind in IMAGES else getattr(nest.leaves[i], "canvas_size", None)
+            if size is not None:
+                sizes.append((type(nest.leaves[i]).__name__, tuple(size)))
+        matrix = next(((nest.keys[i], field.value) for i, field in fields.items() if field.kind == "K"), None)
+        return camera_of_sample(_OWNER, known, own.camera, own.needs_camera, sizes, matrix)
 
     def _kinds(self, nest: _Nest) -> dict[int, str | None]:
         """Return the kind of each leaf that moves, and None for those that may be flags or orders of landmarks."""
@@ -190,7 +194,9 @@ class _Nest:
         """Put the flags of leaf `i` beside it into a nest, if a dict holds it and has none."""
         path = self.paths[i]
         if valid is not None and path and isinstance(path[-1], pytree.MappingKey):
-            holder = functools.reduce(lambda held, step: step.get(held), path[:-1], nest)
+            holder = nest
+            for step in path[:-1]:
+                holder = step.get(holder)
             flags = valid if isinstance(self.leaves[i], Tensor) else valid.numpy()
             holder.setdefault(f"{self.names[i]}_valid", flags)
 
