@@ -12,7 +12,7 @@ from torch import Tensor
 
 from camtorch.calibration.bundle import Adjusted, CameraObservations, Free, Poses, Prior, State, adjust
 from camtorch.calibration.model import Model, asked_model
-from camtorch.calibration.observations import Observations, Points, as_observations, repeats
+from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
 from camtorch.calibration.robust import Loss, as_loss
 from camtorch.calibration.start import Lens, as_seen, other_cameras, other_poses, poses_for, start_from_nothing
 from camtorch.calibration.uncertainty import shared_factor, spread
@@ -75,9 +75,10 @@ def calibrate(
         True
     """
     owner = "calibrate"
-    seen = as_observations(object_points, image_points, image_size, owner)
+    seen, layout = as_observations(object_points, image_points, image_size, owner)
     robust, bend = as_loss(loss, loss_scale, owner), as_flag(bend, "bend", owner)
-    search = Search(owner, asked_model(model, count, start, fixed, owner), seen, middle_of([seen]), robust)
+    asked = asked_model(model, count, start, fixed, layout.image_size, owner)
+    search = Search(owner, asked, seen, layout, middle_of([seen]), robust)
     (result,), _ = results([search], search.alone(bend), search.free(bend))
     if not result.converged:
         warn(f"{owner}: {result.failure} (rms {result.rms:.4g} px). Do not use the result; see its warnings")
@@ -97,6 +98,7 @@ class Search:
     owner: str  # the function, and the camera's name in a rig, for messages
     asked: Model
     seen: Observations
+    layout: Layout  # of what was passed
     middle: Tensor  # (3,) of the boards
     loss: Loss
 
@@ -198,22 +200,22 @@ def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> tuple
     noise = noise * math.sqrt(len(views) / (len(views) - len(again)))
     cameras, state = [], adjusted.state
     for c, (search, own) in enumerate(zip(searches, inliers.split(len(views)), strict=True)):
-        asked, one = search.asked, search.seen
-        copies = one.views[again[one.seen[again].any(-1)]].tolist()
+        asked, one, layout = search.asked, search.seen, search.layout
+        copies = layout.views[again[one.seen[again].any(-1)]].tolist()
         off, has_pixel = adjusted.residuals[c][0], adjusted.valid[c][0]
         camera = Calibration(
-            camera=asked.camera(state.parameters[c][0], one.image_size),
+            camera=asked.camera(state.parameters[c][0]),
             extrinsics=extrinsics_of(state.boards_from(c), search.middle),
             rms=rms_of(off, one.seen),
             sigma=float(sigma),
-            residuals=one.restore(torch.where(has_pixel[..., None], off, torch.nan)),
-            inliers=one.restore(own),
+            residuals=layout.restore(torch.where(has_pixel[..., None], off, torch.nan), one.seen),
+            inliers=layout.restore(own, one.seen),
             parameter_names=asked.names,
             spread=spreads[c].scaled(noise.reshape(1)),
             converged=bool(adjusted.converged[0]) and bool((has_pixel | ~one.seen).all()),
             bend=(float(state.bend[0, 0]), float(state.bend[0, 1])),
-            image_size=one.image_size,
-            views=tuple(one.views.tolist()),
+            image_size=layout.image_size,
+            views=tuple(layout.views.tolist()),
             copies=tuple(copies),
             observations=one,
             adjusted=adjusted,

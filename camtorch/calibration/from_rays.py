@@ -64,10 +64,9 @@ def fit(
         Conversion(rays -> DoubleSphere: rms 0.237 px, max 1.34 px, up to 67.1 degrees, 100 % of the image)
     """
     owner = "fit"
-    asked = asked_model(model, count, None, fixed, owner)
+    asked = asked_model(model, count, None, fixed, as_image_size(image_size, owner), owner)
     start = asked.start
-    size = as_image_size(image_size, owner) or (None if start is None else start.image_size)
-    kept = _kept_values(asked, size, owner)
+    kept = _kept_values(asked, owner)
     seen, batch = _as_seen(pixels, rays, weights, owner)
     counts = seen.valid
     lens = _fit_unified(seen, owner)
@@ -82,7 +81,7 @@ def fit(
     kept = kept.to(starts)
     starts = torch.where(kept[4:].isnan(), starts, kept[4:])
     parameters = fitting.fit(template, seen, starts, slopes, fixed=kept)
-    camera = asked.camera(parameters.reshape(*batch, -1), size)
+    camera = asked.camera(parameters.reshape(*batch, -1))
     found, valid = fixed_camera(asked.kind, parameters[:, :4], parameters[:, 4:]).project(seen.rays)
     shown = valid & counts
     errors = torch.where(shown, torch.linalg.vector_norm(found - seen.pixels, dim=-1), 0.0)
@@ -96,16 +95,16 @@ def fit(
     return Conversion(camera, **{name: t.reshape(batch) for name, t in numbers.items()}, source_name="rays")
 
 
-def _kept_values(asked: Model, size: tuple[int, int] | None, owner: str) -> Tensor:
+def _kept_values(asked: Model, owner: str) -> Tensor:
     """Return the values (4 + n,) that parameters keep, NaN for those to find."""
     if asked.start is not None:
         values = torch.cat([t.detach().double().reshape(-1).cpu() for t in asked.start.tensors])
-    elif size is None and not bool(asked.free[2:4].all()):
+    elif asked.image_size is None and not bool(asked.free[2:4].all()):
         raise ValueError(f"{owner}: image_size must be given if cx or cy is fixed; got None. Pass (height, width)")
     else:
-        height, width = size or (1, 1)
-        middle = [torch.nan, torch.nan, (width - 1) / 2, (height - 1) / 2]
-        values = torch.tensor([*middle, *asked.kind.ideal(asked.count)], dtype=torch.float64, device="cpu")
+        height, width = asked.image_size or (1, 1)
+        intrinsics = [torch.nan, torch.nan, (width - 1) / 2, (height - 1) / 2]
+        values = torch.tensor([*intrinsics, *asked.kind.ideal(asked.count)], dtype=torch.float64, device="cpu")
     return torch.where(asked.free, torch.nan, values)
 
 

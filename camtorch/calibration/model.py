@@ -16,11 +16,12 @@ from camtorch.values.arguments import as_whole, no_camera
 
 @dataclass(frozen=True)
 class Model:
-    """The camera to find: its class, number of coefficients, parameters that are held, by name, and start or None."""
+    """The camera to find."""
 
     kind: type[Camera]
-    count: int
-    fixed: tuple[str, ...] = ()
+    count: int  # of coefficients
+    image_size: tuple[int, int] | None = None
+    fixed: tuple[str, ...] = ()  # the names of parameters that are held
     start: Camera | None = None
 
     @property
@@ -33,10 +34,10 @@ class Model:
         """Whether parameters are free, (4 + n,) bool on the CPU."""
         return torch.tensor([name not in self.fixed for name in self.names], device="cpu")
 
-    def camera(self, parameters: Tensor, image_size: tuple[int, int] | None) -> Camera:
+    def camera(self, parameters: Tensor) -> Camera:
         """Return the camera of parameters (*B, 4 + n), with the same names frozen as in the camera to start from."""
         found = self.kind(*parameters.split((4, self.count) if self.count else 4, -1))
-        found.image_size = image_size  # set later, as crops may be off centre
+        found.image_size = self.image_size  # set later, as crops may be off centre
         frozen = () if self.start is None else frozen_names(self.start)
         if frozen:
             found.freeze(*frozen)
@@ -48,9 +49,10 @@ def asked_model(
     count: int | None,
     start: Camera | None,
     fixed: Collection[str] | str,
+    image_size: tuple[int, int] | None,
     owner: str,
 ) -> Model:
-    """Return the camera that the arguments of `calibrate` ask for."""
+    """Return the camera that the arguments of `calibrate` ask for; its image size is by default that of the start."""
     if isinstance(model, Camera):
         if start is not None:
             raise ValueError(f"{owner}: start must be left out if model is a camera; got {start!r}")
@@ -78,7 +80,9 @@ def asked_model(
     held = [*fixed, *(() if start is None else frozen_names(start))]
     if start is not None and kind.smoothness() is not None:
         held += INTRINSICS
-    return Model(kind, count, tuple(held), start)
+    if image_size is None and start is not None:
+        image_size = start.image_size
+    return Model(kind, count, image_size, tuple(held), start)
 
 
 def _as_start(start: Camera, kind: type[Camera], owner: str) -> Camera:

@@ -30,34 +30,40 @@ _NAMED = 6  # views at most, in a message
 class Observations(NamedTuple):
     """Corners of boards and their pixels in one camera: float64, padded to the number of the fullest view.
 
-    V are the views that have corners in some camera, of all that were passed.
+    V are the views that have corners in some camera. Results hold these, so pickles of 0.5.0 have the three fields.
     """
 
     points: Tensor  # (V, N, 3) in the board's frame, 0 if padded
     pixels: Tensor  # (V, N, 2), 0 if unseen
     seen: Tensor  # (V, N) bool
-    views: Tensor  # (V,) their indices among the views that were passed
-    image_size: tuple[int, int]  # (height, width)
-    shapes: tuple[tuple[int, ...], ...]  # of each view that was passed, without the last dim; (N,) for None
-    stacked: bool  # whether the image points were one tensor or array, not a list
 
     def of(self, rows: Tensor) -> Observations:
         """Return the observations of some views."""
-        points, pixels, seen, views = (t[rows] for t in (self.points, self.pixels, self.seen, self.views))
-        return self._replace(points=points, pixels=pixels, seen=seen, views=views)
+        return Observations(*(t[rows] for t in self))
 
-    def restore(self, values: Tensor) -> Any:
-        """Return results (V, N, k) or (V, N) in the form of the image points, NaN (of bool: False) if unseen."""
+
+class Layout(NamedTuple):
+    """The image points of one camera as they were passed."""
+
+    views: Tensor  # (V,) the indices of the views with observations among those that were passed
+    image_size: tuple[int, int]  # (height, width)
+    shapes: tuple[tuple[int, ...], ...]  # of each view that was passed, without the last dim; (N,) for None
+    stacked: bool  # whether they were one tensor or array, not a list
+
+    def restore(self, values: Tensor, seen: Tensor) -> Any:
+        """Return results (V, N, k) or (V, N) in the form of the image points, NaN (of bool: False) if not `seen`."""
         rest, empty = values.shape[2:], values.new_tensor(False if values.dtype == torch.bool else torch.nan)
         full = empty.repeat(len(self.shapes), *values.shape[1:])
-        full[self.views] = torch.where(self.seen.reshape(*self.seen.shape, *[1] * len(rest)), values, empty)
+        full[self.views] = torch.where(seen.reshape(*seen.shape, *[1] * len(rest)), values, empty)
         if self.stacked:
             return full.reshape(len(full), *self.shapes[0], *rest)
         return [row[: math.prod(shape)].reshape(*shape, *rest) for row, shape in zip(full, self.shapes, strict=True)]
 
 
-def as_observations(object_points: Points, image_points: Points, image_size: Sequence[int], owner: str) -> Observations:
-    """Return the observations of one camera, of views that have corners."""
+def as_observations(
+    object_points: Points, image_points: Points, image_size: Sequence[int], owner: str
+) -> tuple[Observations, Layout]:
+    """Return the observations of one camera, of views that have corners, and how they were passed."""
     return as_rig_observations(object_points, {"": image_points}, {"": image_size}, {"": None}, owner)[""]
 
 
@@ -67,8 +73,8 @@ def as_rig_observations(
     image_sizes: Mapping[str, Sequence[int]],
     models: Mapping[str, Any],
     owner: str,
-) -> dict[str, Observations]:
-    """Return the observations of a rig's cameras of the same boards, by name in the order of the models."""
+) -> dict[str, tuple[Observations, Layout]]:
+    """Return the observations of a rig's cameras of the same boards, and how they were passed, in the models' order."""
     for argument, given in {"models": models, "image_points": image_points, "image_sizes": image_sizes}.items():
         is_mapping = isinstance(given, Mapping)
         if not is_mapping or not given or set(given) != set(models):
@@ -87,7 +93,7 @@ def as_rig_observations(
     boards = [board.to(device) for board in boards]
     boards = boards * count if len(boards) == 1 else boards
     points = pad_sequence(boards, batch_first=True, padding_value=torch.nan)
-    found: dict[str, Observations] = {}  # of all views, NaN if padded or unseen
+    found: dict[str, tuple[Observations, Layout]] = {}  # of all views, NaN if padded or unseen
     for name, (views, shapes, stacked) in by_name.items():
         size = as_known_size(image_sizes[name], owners[name])
         pixels = torch.full_like(points[..., :2], torch.nan)
@@ -98,20 +104,20 @@ def as_rig_observations(
                     f"(inner ones of a chessboard); got {len(view)}. Pass rows of NaN for corners that were not found"
                 )
             pixels[i, : len(view)] = view
+        one = Observations(points, pixels, ~pixels.isnan().any(-1))
+        _check_corners(one, owners[name])
+        _check_inside(one, size, owners[name])
         forms = tuple((len(b),) if shape is None else shape for b, shape in zip(boards, shapes, strict=True))
-        every = torch.arange(count, device=device)
-        found[name] = Observations(points, pixels, ~pixels.isnan().any(-1), every, size, forms, stacked)
-        _check_corners(found[name], owners[name])
-        _check_inside(found[name], owners[name])
-    sees = torch.stack([one.seen.any(-1) for one in found.values()])
+        found[name] = one, Layout(torch.arange(count, device=device), size, forms, stacked)
+    sees = torch.stack([one.seen.any(-1) for one, _ in found.values()])
     _check_linked(sees, list(found), owner)
     if not bool(sees.any(0).all()):
         warn(f"{owner}: {_views_of(~sees.any(0))} left out, because nothing was seen")
     (kept,) = sees.any(0).nonzero(as_tuple=True)
     points = points.nan_to_num()
-    for name, one in found.items():
+    for name, (one, layout) in found.items():
         pixels = torch.where(one.seen[..., None], one.pixels, 0.0)
-        found[name] = one._replace(points=points, pixels=pixels).of(kept)
+        found[name] = Observations(points, pixels, one.seen).of(kept), layout._replace(views=kept)
     return found
 
 
@@ -210,9 +216,9 @@ def _check_corners(given: Observations, owner: str) -> None:
             raise ValueError(f"{owner}: {_views_of(wrong & (number > 0))}: {words}")
 
 
-def _check_inside(given: Observations, owner: str) -> None:
+def _check_inside(given: Observations, size: tuple[int, int], owner: str) -> None:
     """Raise if pixels do not lie in an image of the camera's size."""
-    pixels, seen, size = given.pixels, given.seen, given.image_size
+    pixels, seen = given.pixels, given.seen
     found = pixels[seen]
 
     def outside(sides: tuple[int, int]) -> Tensor:

@@ -135,11 +135,12 @@ def calibrate_rig(
         if stray:
             unknown = ", ".join(map(repr, stray))
             raise ValueError(f"{owner}: names must be those of cameras, {', '.join(by_name)}; got {unknown}")
-    middle, searches = middle_of([*by_name.values()]), []
-    for name, observations in by_name.items():
-        of = f"{owner}: {name}"
-        asked = asked_model(models[name], _own(count, name, None), _own(start, name, None), _own(fixed, name, ()), of)
-        searches.append(Search(of, asked, observations, middle, robust))
+    middle, searches = middle_of([seen for seen, _ in by_name.values()]), []
+    for name, (seen, layout) in by_name.items():
+        of, own_start = f"{owner}: {name}", _own(start, name, None)
+        own_count, own_fixed = _own(count, name, None), _own(fixed, name, ())
+        asked = asked_model(models[name], own_count, own_start, own_fixed, layout.image_size, of)
+        searches.append(Search(of, asked, seen, layout, middle, robust))
     observed = [search.observed for search in searches]
     learns = tuple(parameters for search in searches for parameters in search.free().parameters)
     free = Free(learns, mounts=True, bend=bend)
@@ -153,11 +154,11 @@ def calibrate_rig(
         mounts[name] = Extrinsics(rotation_vector(rotation).unsqueeze(-1), shift)
         mount_std[name] = std[places] if places else std.new_zeros(6)
     cameras = dict(zip(by_name, found, strict=True))
-    residuals, seen = torch.cat([r[0] for r in adjusted.residuals]), torch.cat([one.seen for one in by_name.values()])
+    residuals = torch.cat([r[0] for r in adjusted.residuals])
     result = RigCalibration(
         rig=Rig({name: c.camera for name, c in cameras.items()}, mounts),
         boards=extrinsics_of(adjusted.state.boards, middle),
-        rms=rms_of(residuals, seen),
+        rms=rms_of(residuals, torch.cat([search.seen.seen for search in searches])),
         sigma=found[0].sigma,
         cameras=cameras,
         mount_std=mount_std,

@@ -83,12 +83,12 @@ def select(
     Arguments are those of `calibrate`; `fixed` may name parameters that a model does not have, and `progress` is called
     with the part that is done. candidates: models and their numbers of coefficients.
     """
-    seen = as_observations(object_points, image_points, image_size, "select")
+    seen, layout = as_observations(object_points, image_points, image_size, "select")
     points = seen.points.cpu().numpy()
     pixels = np.where(seen.seen[..., None].cpu(), seen.pixels.cpu(), np.nan)
 
     def calibrated(rows: NDArray[Any], model: str | Camera, **options: Any) -> Calibration:
-        return calibrate(model, points[rows], pixels[rows], image_size=seen.image_size, **options)
+        return calibrate(model, points[rows], pixels[rows], image_size=layout.image_size, **options)
 
     weights = np.isfinite(pixels[..., 0]).sum(1)  # the corners of each view
     tried, trials = list(candidates), []

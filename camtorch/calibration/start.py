@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -28,7 +28,7 @@ _TRIED = {
     0.65: (14.0, 28.0, 46.0, 66.0, 88.0),
 }
 _VIEWS, _POINTS = 24, 100  # at most, in a search
-_ROUNDS = 4  # of finding poses
+_ROUNDS = 3  # of finding poses again without outliers
 _BAD = 2.0  # times the usual error: the pose of such a view may be wrong
 _IN_DOUBT = 4.0  # times the better pose's error: below it the other pose is refined as well
 _HANDFULS, _HANDFUL = 48, 6  # samples, and corners of each, if outliers spoil the pose of all corners
@@ -64,37 +64,43 @@ def start_from_nothing(observations: Observations, asked: Model, loss: Loss) -> 
     few are refined with a Cauchy loss, and the model is fitted to the best one from several starts. Fixed parameters
     are held: coefficients as in `Camera.ideal`, the principal point in the middle of the image.
     """
-    few, free = _subsample(observations), _free_parameters(asked)
-    lens = first = _find_unified(few, asked.fixed)
-    if asked.count and all(asked.kind.fit_bounds.get(name, ()) is None for name in asked.names[4:]):
-        # a model that keeps its start's shape takes that of a good lens
-        good = Model(KannalaBrandt, 4, asked.fixed)
-        fitted = _fit_model(lens, few, good)
-        lens = _refine(fitted, few, _free_parameters(good), Loss("cauchy", lens.scale)).of(slice(1))
-    lens = _fit_model(lens, few, asked)
+    few, free = _subsample(observations, asked), _free_parameters(asked)
+    unified = _find_unified(few, asked)
+    lens = _fit_model(_in_good_shape(unified, few, asked), few, asked)
     if few is not observations or len(lens.parameters) > 1 or bool(lens.lost(few).any()):
         lens = _refine(lens, few, free, loss)
-        one = lens.of(slice(1))
-        lost, seen = int(one.lost(few).sum()), int(few.seen.sum())
-        may_lose = _LOST * seen if one.scale <= _ERRS * first.scale else 0
-        if lost > may_lose:
-            raise ValueError(
-                f"calibrate: model must have pixels for all corners; got {one.model.__name__}, without {lost} of {seen}"
-                ". Use a fisheye, such as kannala_brandt"
-            )
-    one = lens.of(slice(1))
-    state = one.state if few is observations else poses_for(one, observations)
+        _check_pixels(lens.best, few, unified.scale)
+    state = lens.best.state if few is observations else poses_for(lens.best, observations)
     if len(lens.parameters) == 1:
         return state
     lens = lens._replace(boards=state.boards.expand(len(lens.parameters)))
-    observed = [as_seen(asked.kind, observations)]
-    found = adjust(observed, lens.state, free, loss=loss, steps=_MANY_STEPS)
+    found = adjust([as_seen(asked.kind, observations)], lens.state, free, loss=loss, steps=_MANY_STEPS)
     return found.state.of(found.cost.argmin()[None])
+
+
+def _in_good_shape(lens: Lens, few: Observations, asked: Model) -> Lens:
+    """Return the lens, for models that keep their start's shape a better one: Kannala and Brandt's."""
+    if not asked.count or any(asked.kind.fit_bounds.get(name, ()) is not None for name in asked.names[4:]):
+        return lens
+    good = replace(asked, kind=KannalaBrandt, count=4)
+    fitted = _fit_model(lens, few, good)
+    return _refine(fitted, few, _free_parameters(good), Loss("cauchy", lens.scale)).best
+
+
+def _check_pixels(lens: Lens, few: Observations, scale: float) -> None:
+    """Raise if a camera has no pixels for corners, or for many of them if it fits as well as a lens of that scale."""
+    lost, seen = int(lens.lost(few).sum()), int(few.seen.sum())
+    if lost > (_LOST * seen if lens.scale <= _ERRS * scale else 0):
+        raise ValueError(
+            f"calibrate: model must have pixels for all corners; got {lens.model.__name__}, without {lost} of {seen}"
+            ". Use a fisheye, such as kannala_brandt"
+        )
 
 
 def poses_for(lens: Lens, observations: Observations) -> State:
     """Return the state of a known camera, B = 1, and all views' poses, whatever poses the lens has."""
-    boards, errors = _find_poses(lens.camera, observations)
+    camera = lens.camera
+    boards, errors = _without_outliers(camera, observations, *_closed_form(camera, observations))
     return _choose_poses(lens._replace(boards=boards), observations, errors).state
 
 
@@ -149,10 +155,15 @@ class Lens(NamedTuple):
     def of(self, rows: Tensor | slice) -> Lens:
         return self._replace(parameters=self.parameters[rows], boards=self.boards.of(rows))
 
-    def adjusted(self, few: Observations, free: Free, steps: int, worst: float, loss: Loss | None = None) -> Lens:
+    @property
+    def best(self) -> Lens:
+        """The first camera of those that are sorted."""
+        return self.of(slice(1))
+
+    def adjusted(
+        self, few: Observations, free: Free, steps: int, worst: float, loss: Loss, settled: float = SETTLED
+    ) -> Lens:
         """Return adjusted cameras, the best first, without doubles and costs above `worst` times the least."""
-        settled = _NEARLY if loss is None else SETTLED
-        loss = loss or Loss("cauchy", self.scale)
         found = adjust([as_seen(self.model, few)], self.state, free, loss=loss, steps=steps, settled=settled)
         cost, rows = found.cost.sort()
         near = cost <= worst * cost[0]
@@ -176,14 +187,14 @@ def _free_parameters(asked: Model) -> Free:
     return Free((asked.free & ~kept,))
 
 
-def _subsample(observations: Observations) -> Observations:
+def _subsample(observations: Observations, asked: Model) -> Observations:
     """Return the views with most corners, and enough corners of each, evenly from the image's middle outwards."""
     if len(observations.seen) > _VIEWS:
         observations = observations.of(observations.seen.sum(-1).argsort(descending=True)[:_VIEWS].sort().values)
     points, pixels, seen = observations.points, observations.pixels, observations.seen
     if seen.shape[1] <= _POINTS:
         return observations
-    distances = torch.linalg.vector_norm(pixels - _middle(observations), dim=-1)
+    distances = torch.linalg.vector_norm(pixels - _middle(asked, pixels), dim=-1)
     order = torch.where(seen, distances, torch.inf).argsort(-1)
     share = torch.linspace(0, 1, _POINTS, dtype=pixels.dtype, device=pixels.device)
     index = order.gather(-1, (share * (seen.sum(-1, keepdim=True) - 1).clamp(min=0)).round().long())
@@ -192,65 +203,76 @@ def _subsample(observations: Observations) -> Observations:
     return observations._replace(points=points, pixels=pixels, seen=seen.gather(-1, index) & once)
 
 
-def _middle(observations: Observations) -> Tensor:
+def _middle(asked: Model, like: Tensor) -> Tensor:
     """Return the middle (2,) of the image."""
-    height, width = observations.image_size
-    return observations.pixels.new_tensor([(width - 1) / 2, (height - 1) / 2])
+    assert asked.image_size is not None  # of a calibration it is known
+    height, width = asked.image_size
+    return like.new_tensor([(width - 1) / 2, (height - 1) / 2])
 
 
-def _find_unified(few: Observations, fixed: Collection[str]) -> Lens:
-    centre = _middle(few)
+def _find_unified(few: Observations, asked: Model) -> Lens:
+    """Return the best of many unified lenses, adjusted, with the best pose of each view."""
+    lens = _unified_to_try(few, asked)
+    lens, errors = _ranked(lens, *_closed_form(lens.camera, few), len(lens.parameters), 4.0)
+    lens, _ = _ranked(lens, *_without_outliers(lens.camera, few, lens.boards, errors), 3, 2.0)
+    free = _free_parameters(Model(UCM, 1, fixed=tuple(name for name in asked.fixed if name in ("cx", "cy"))))
+    lens = lens.adjusted(few, free, _STEPS, _WORSE, Loss("cauchy", lens.scale), _NEARLY).best
+    return _choose_poses(lens, few, _errors(lens.camera, lens.boards, few))
+
+
+def _unified_to_try(few: Observations, asked: Model) -> Lens:
+    """Return the lenses of `_TRIED`, without poses."""
+    centre = _middle(asked, few.pixels)
     reach = torch.where(few.seen, torch.linalg.vector_norm(few.pixels - centre, dim=-1), 0.0).amax()
     tried = [(alpha, math.radians(degrees)) for alpha, angles in _TRIED.items() for degrees in angles]
     radii = [math.sin(theta) / (alpha + (1 - alpha) * math.cos(theta)) for alpha, theta in tried]
     focal = reach / centre.new_tensor(radii)[:, None]
     alpha = centre.new_tensor([alpha for alpha, _ in tried])[:, None]
     parameters = torch.cat((focal, focal, centre.expand(len(tried), 2), alpha), -1)
-    lens = Lens(UCM, parameters, Poses.none(1, 1, parameters))
-    begun = None
-    # rounds, the most lenses kept after these, and their largest error over the best one's
-    for rounds, kept, unlike in ((1, len(tried), 4.0), (_ROUNDS, 3, 2.0)):
-        boards, errors = _find_poses(lens.camera, few, rounds, begun)
-        by_view = errors.nanmedian(-1).values.sort(-1).values
-        score = by_view[:, : math.ceil(_TRIMMED * by_view.shape[1])].mean(-1)
-        score, rows = score.topk(min(kept, len(score)), largest=False)
-        rows = rows[score <= unlike * score[0]]
-        lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(score[0]))).of(rows)
-        begun = lens.boards, errors[rows]
-    free = _free_parameters(Model(UCM, 1, tuple(name for name in fixed if name in ("cx", "cy"))))
-    lens = lens.adjusted(few, free, _STEPS, _WORSE).of(slice(1))
-    return _choose_poses(lens, few, _errors(lens.camera, lens.boards, few))
+    return Lens(UCM, parameters, Poses.none(1, 1, parameters))
 
 
-def _find_poses(
-    camera: Camera, some: Observations, rounds: int = _ROUNDS, begun: tuple[Poses, Tensor] | None = None
-) -> tuple[Poses, Tensor]:
-    """Return closed-form poses (B, V) for cameras (B,), and errors (B, V, N) in px; NaN if a corner is unseen.
+def _ranked(lens: Lens, boards: Poses, errors: Tensor, most: int, unlike: float) -> tuple[Lens, Tensor]:
+    """Return the best lenses with these poses and their errors: `most`, up to `unlike` times the best one's error."""
+    by_view = errors.nanmedian(-1).values.sort(-1).values
+    score = by_view[:, : math.ceil(_TRIMMED * by_view.shape[1])].mean(-1)
+    score, rows = score.topk(min(most, len(score)), largest=False)
+    rows = rows[score <= unlike * score[0]]
+    lens = lens._replace(boards=boards, scale=max(_LEAST_SCALE, 2 * float(score[0])))
+    return lens.of(rows), errors[rows]
 
-    Each round weighs the outliers of the one before less. begun: the result of the first round, if it is known.
-    """
+
+def _closed_form(camera: Camera, some: Observations) -> tuple[Poses, Tensor]:
+    """Return closed-form poses (B, V) for cameras (B,), and errors (B, V, N) in px; NaN if a corner is unseen."""
     rays, has_ray = _rays(camera, some)
-    shape = has_ray.shape
-    points = some.points.expand(*shape, 3).flatten(0, 1)
-    rays, has_ray = rays.flatten(0, 1), has_ray.flatten(0, 1)
-    weights, rows = has_ray.to(rays.dtype), torch.arange(len(rays), device=rays.device)
-    boards, errors = begun or (Poses.none(shape[0], shape[1], rays), rays.new_empty(0))
-    before = rays.new_full(shape[:2], torch.inf)
-    for i in range(rounds):
-        if i > 0:
-            usual = errors.nanmedian(-1).values.clamp(min=_LEAST_SCALE / 2)
-            if i > 1:
-                (rows,) = (usual < _CHANGED * before).flatten().nonzero(as_tuple=True)
-            if len(rows) == 0:
-                break
-            weights = 1 / (1 + (errors / (2 * usual[..., None])).square())
-            weights, before = torch.where(has_ray, weights.flatten(0, 1), 0.0), usual
-        elif begun:
-            continue
-        found = poses_from_rays(points[rows], rays[rows], weights[rows])
-        for poses, new in zip(boards, found[:2], strict=True):
-            poses.flatten(0, 1)[rows] = new[:, 0]
-        errors = _errors(camera, boards, some)
+    points = some.points.expand_as(rays)
+    found = poses_from_rays(*(t.flatten(0, 1) for t in (points, rays, has_ray.to(rays.dtype))))
+    boards = Poses(*(t[:, 0].unflatten(0, has_ray.shape[:2]) for t in found[:2]))
+    return boards, _errors(camera, boards, some)
+
+
+def _without_outliers(camera: Camera, some: Observations, boards: Poses, errors: Tensor) -> tuple[Poses, Tensor]:
+    """Return closed-form poses and their errors after rounds that weigh the outliers of the one before less."""
+    rays, has_ray = _rays(camera, some)
+    points = some.points.expand_as(rays).flatten(0, 1)
+    usual = errors.nanmedian(-1).values.clamp(min=_LEAST_SCALE / 2)
+    is_better = torch.ones_like(usual, dtype=torch.bool)
+    for _ in range(_ROUNDS):
+        (rows,) = is_better.flatten().nonzero(as_tuple=True)
+        if len(rows) == 0:
+            break
+        weights = 1 / (1 + (errors / (2 * usual[..., None])).square())
+        weights = torch.where(has_ray, weights, 0.0).flatten(0, 1)
+        found = poses_from_rays(points[rows], rays.flatten(0, 1)[rows], weights[rows])
+        boards = Poses(
+            *(
+                old.flatten(0, 1).index_copy(0, rows, new[:, 0]).view_as(old)
+                for old, new in zip(boards, found[:2], strict=True)
+            )
+        )
+        errors, before = _errors(camera, boards, some), usual
+        usual = errors.nanmedian(-1).values.clamp(min=_LEAST_SCALE / 2)
+        is_better = usual < _CHANGED * before
     return boards, errors
 
 
@@ -307,15 +329,19 @@ def _choose_poses(lens: Lens, some: Observations, errors: Tensor) -> Lens:
     usual, other, others = torch.cat((errors, _errors(camera, both, some))).nanmedian(-1).values
     first = Poses.where(usual <= other, old, first)
     (rows,) = (others <= _IN_DOUBT * torch.minimum(usual, other)).nonzero(as_tuple=True)
-    if len(rows) == 0:
-        return lens._replace(boards=first)
-    both = Poses(*(torch.cat((a[0, rows], b[0, rows]))[:, None] for a, b in zip(first, second, strict=True)))
-    twice, loss = some.of(rows.repeat(2)), Loss("cauchy", lens.scale)
-    poses, cost = minima(lens.model, lens.parameters, both, twice, loss, _FEW_STEPS)
-    halves = slice(len(rows)), slice(len(rows), None)
-    a, b = (Poses(*(t[half].transpose(0, 1) for t in poses)) for half in halves)
-    better = Poses.where(cost[halves[0]] <= cost[halves[1]], a, b)
-    return lens._replace(boards=first.with_views(rows, better))
+    if len(rows):
+        first = first.with_views(rows, _better_minima(lens, some.of(rows), first.of(rows, 1), second.of(rows, 1)))
+    return lens._replace(boards=first)
+
+
+def _better_minima(lens: Lens, some: Observations, first: Poses, second: Poses) -> Poses:
+    """Return for each view the better one of the minima near two poses, (1, V) each."""
+    both = Poses(*(torch.cat(pair, 1).transpose(0, 1) for pair in zip(first, second, strict=True)))
+    twice = Observations(*(torch.cat((t, t)) for t in some))
+    found, costs = minima(lens.model, lens.parameters, both, twice, Loss("cauchy", lens.scale), _FEW_STEPS)
+    one, other = (Poses(*pair) for pair in zip(*(t.transpose(0, 1).chunk(2, 1) for t in found), strict=True))
+    cost, other_cost = costs.chunk(2)
+    return Poses.where(cost <= other_cost, one, other)
 
 
 def _refine(lens: Lens, few: Observations, free: Free, loss: Loss) -> Lens:
@@ -330,30 +356,39 @@ def _fit_model(lens: Lens, few: Observations, asked: Model) -> Lens:
     slopes = views.focal_at_axis(camera)
     rays = torch.nn.functional.normalize(lens.boards.moved(few.points), dim=-1)
     inliers = few.seen & (_errors(camera, lens.boards, few) < 3 * lens.scale)
-    reach = torch.where(inliers, angles_from_axis(rays), 0.0).amax((-1, -2))
     ideal = slopes.new_tensor(model.ideal(asked.count))
     starts = ideal[None]
     if asked.count:
+        reach = torch.where(inliers, angles_from_axis(rays), 0.0).amax((-1, -2))
         by_radii = views.radii(camera, slopes, (_REACH * reach).clamp(max=math.pi))
         starts = model.fit_start(asked.names[4:], *by_radii)[:, 0]
     begun, held = _coefficients_to_try(asked, starts, ideal)
     seen = fitting.RayPixels(rays.flatten(1, 2), few.pixels.flatten(0, 1)[None], inliers.flatten(1).double())
     seen = fitting.RayPixels(*(t.expand(len(begun), *t.shape[1:]) for t in seen))
-    template = fixed_camera(model, slopes[:1], ideal[None])
-    slopes = slopes.expand(len(begun), -1)
-    ones = slopes.new_tensor([1.0, 1.0, 0.0, 0.0]).expand_as(slopes)
-    focal = slopes[:, :2] / views.focal_at_axis(fixed_camera(model, ones, begun))[:, :2].clamp(min=_LEAST_SLOPE)
-    parameters = torch.cat((focal, slopes[:, 2:], begun), -1)
+    parameters = _with_focal_lengths(model, begun, slopes)
     _, valid = fixed_camera(model, parameters[:, :4], begun).project(seen.rays)
     if model.key in _ALONG or not bool((valid | (seen.weights == 0)).all()):
-        parameters = fitting.fit(template, seen, begun[None], slopes, fixed=held)
-    # cameras that nearly equal an earlier one are dropped
-    apart = (parameters[:, None] - parameters).abs() > _ALIKE * (parameters.abs() + _ALIKE)
-    parameters = parameters[~(~apart.any(-1)).tril(-1).any(-1)]
+        template = fixed_camera(model, slopes, ideal[None])
+        parameters = fitting.fit(template, seen, begun[None], slopes.expand(len(begun), -1), fixed=held)
+    parameters = _without_doubles(parameters)
     for i, name in enumerate(("cx", "cy")):
         if name in asked.fixed:
-            parameters[:, 2 + i] = _middle(few)[i]
+            parameters[:, 2 + i] = _middle(asked, parameters)[i]
     return lens._replace(model=model, parameters=parameters, boards=lens.boards.expand(len(parameters)))
+
+
+def _with_focal_lengths(model: type[Camera], coefficients: Tensor, slopes: Tensor) -> Tensor:
+    """Return parameters (S, 4 + n) with such slopes (1, 4) at the axis; coefficients: (S, n)."""
+    slopes = slopes.expand(len(coefficients), -1)
+    ones = slopes.new_tensor([1.0, 1.0, 0.0, 0.0]).expand_as(slopes)
+    own = views.focal_at_axis(fixed_camera(model, ones, coefficients))[:, :2].clamp(min=_LEAST_SLOPE)
+    return torch.cat((slopes[:, :2] / own, slopes[:, 2:], coefficients), -1)
+
+
+def _without_doubles(parameters: Tensor) -> Tensor:
+    """Return the cameras (S, 4 + n) that do not nearly equal an earlier one."""
+    apart = (parameters[:, None] - parameters).abs() > _ALIKE * (parameters.abs() + _ALIKE)
+    return parameters[~(~apart.any(-1)).tril(-1).any(-1)]
 
 
 def _coefficients_to_try(asked: Model, starts: Tensor, ideal: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,7 +1,7 @@
 """Linearised least squares as triangles of a QR: of each view's own unknowns, and of those that all views share."""
 
 from ctypes import addressof, c_int64
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -10,7 +10,8 @@ from camtorch.native.library import library, loaded
 from camtorch.native.structs import Steps
 
 
-class Equations(NamedTuple):
+@dataclass(frozen=True)  # and no tuple: pickles of 0.5.0 have one of three fields, which nobody reads
+class Equations:
     """Triangles of the linearised problem, with L unknowns of each view, and G unknowns that all views share.
 
     A row of `view` means view[:L] * step of the view + view[L:-1] * shared step = -view[-1].
@@ -42,7 +43,7 @@ class System:
                 torch.where(keep[:, None, width:], equations.shared, 0.0),
             )
             # without a column the rest is not a triangle
-            self.equations = equations._replace(shared=torch.linalg.qr(equations.shared, mode="r").R)
+            self.equations = replace(equations, shared=torch.linalg.qr(equations.shared, mode="r").R)
             view, shared = self.equations.view[..., -1], self.equations.shared[:, :-1, -1]
             self.decrement = view.square().sum((-1, -2)) + shared.square().sum(-1)
 

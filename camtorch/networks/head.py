@@ -89,9 +89,8 @@ class CameraHead(GeometryModule):
         names = (fixed,) if isinstance(fixed, str) else fixed
         if isinstance(names, Collection) and any(isinstance(name, str) and name in _NEVER_FIXED for name in names):
             raise ValueError(f"{owner}: fixed must not name fx, fy or all; got {fixed!r}. Use fov=(90, 90)")
-        asked = asked_model(model, count, None, fixed, owner)
-        known = None if asked.start is None else asked.start.image_size
-        size = as_image_size(image_size, owner) or known
+        asked = asked_model(model, count, None, fixed, as_image_size(image_size, owner), owner)
+        known, size = None if asked.start is None else asked.start.image_size, asked.image_size
         if size is None:
             raise ValueError(f"{owner}: image_size must be given; got None. Pass image_size=(height, width)")
         if known not in (None, size):

@@ -1,12 +1,15 @@
 """What must hold of calibrations: the optimum from nothing, the same for all forms and orders, outliers named."""
 
 import copy
+import gzip
 import math
+import pickle
 
 import pytest
 import torch
 from boards import opencv_left, ov_plane, seen_by
 from cameras import DISTINCT, one, slow_unless
+from rigs import FILES
 from torch.testing import assert_close
 
 import camtorch as ct
@@ -324,3 +327,23 @@ def test_a_surface_is_learnt_in_the_frame_of_its_start(order):
     assert found.converged
     turned = (found.extrinsics.matrix()[:, :3, :3].detach() @ rotations.mT).mean(0)
     assert_close(turned, torch.eye(3).double(), rtol=0, atol=2e-3)
+
+
+def test_pickles_of_0_5_0_are_loaded():
+    loaded = pickle.loads(gzip.decompress((FILES / "calibrations_0.5.0.pickle.gz").read_bytes()))
+
+    def seen_by(result):
+        points, pixels, seen = result.observations
+        return points[0], torch.where(seen[..., None], pixels, torch.nan)
+
+    one, rig = loaded["calibrate"], loaded["calibrate_rig"]
+    points, pixels = seen_by(one)
+    again = ct.calibrate("pinhole", points, pixels, image_size=one.image_size)
+    assert_close(one.camera.intrinsics, again.camera.intrinsics)
+    assert_close(one.residuals, again.residuals, equal_nan=True)
+    assert one.warnings == again.warnings
+    image_points = {name: seen_by(result)[1] for name, result in rig.cameras.items()}
+    sizes = {name: result.image_size for name, result in rig.cameras.items()}
+    rig_again = ct.calibrate_rig(dict.fromkeys(sizes, "pinhole"), points, image_points, image_sizes=sizes)
+    assert_close(rig.std, rig_again.std)
+    assert rig.warnings == rig_again.warnings

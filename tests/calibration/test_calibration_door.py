@@ -45,7 +45,7 @@ REPEATED = np.repeat(BOARD[None], len(VIEWS), 0)
     ],
 )
 def test_forms_of_object_points(object_points):
-    same(as_observations(object_points, VIEWS, SIZE, OWNER), REPEATED, VIEWS)
+    same(as_observations(object_points, VIEWS, SIZE, OWNER)[0], REPEATED, VIEWS)
 
 
 FORMS = [VIEWS, VIEWS[:, :, None], VIEWS[:, None], torch.from_numpy(VIEWS), torch.from_numpy(VIEWS).double()]
@@ -55,13 +55,13 @@ FORMS += [[v[:, None] for v in VIEWS], [v[None] for v in VIEWS]]
 
 @pytest.mark.parametrize("image_points", FORMS)
 def test_forms_of_image_points_and_back(image_points):
-    observations = as_observations(BOARD, image_points, SIZE, OWNER)
+    observations, layout = as_observations(BOARD, image_points, SIZE, OWNER)
     same(observations, REPEATED, VIEWS)
     assert not observations.pixels.requires_grad
     assert observations.seen.all()
-    assert observations.image_size == SIZE
+    assert layout.image_size == SIZE
     for values, size in ((observations.pixels, (2,)), (observations.seen, ()), (observations.pixels[..., 0], ())):
-        back = observations.restore(values)
+        back = layout.restore(values, observations.seen)
         assert isinstance(back, torch.Tensor if isinstance(image_points, (torch.Tensor, np.ndarray)) else list)
         for one, view, value in zip(back, image_points, values, strict=True):
             assert tuple(one.shape) == (*np.shape(np.asarray(view) if isinstance(view, list) else view)[:-1], *size)
@@ -72,17 +72,17 @@ def test_forms_of_image_points_and_back(image_points):
 def test_numbers_of_all_kinds():
     whole, half, far = VIEWS.astype(np.int32), torch.from_numpy(VIEWS).half(), BOARD + np.array([1e6, 0, 0])
     for points, pixels in ((BOARD, whole), (BOARD, half), (far, VIEWS)):
-        same(as_observations(points, pixels, SIZE, OWNER), np.repeat(points[None], 5, 0), pixels)
+        same(as_observations(points, pixels, SIZE, OWNER)[0], np.repeat(points[None], 5, 0), pixels)
 
 
 def test_nan_is_unseen_and_boards_may_lack_what_is_unseen():
     image_points, points = VIEWS.copy(), REPEATED.copy()
     image_points[1, 5:7] = image_points[0, 2] = image_points[1, 7, 0] = points[1, 5] = np.nan
-    observations = as_observations(points, image_points, SIZE, OWNER)
+    observations, layout = as_observations(points, image_points, SIZE, OWNER)
     assert (~observations.seen).nonzero().tolist() == [[0, 2], [1, 5], [1, 6], [1, 7]]
     assert (observations.pixels[1, 5:8] == 0).all()
     assert (observations.points[1, 5] == 0).all()
-    back, inliers = observations.restore(observations.pixels), observations.restore(torch.ones_like(observations.seen))
+    back, inliers = (layout.restore(t, observations.seen) for t in (observations.pixels, observations.seen | True))
     assert back[1][5:8].isnan().all()
     assert not inliers[1][5:8].any()
 
@@ -91,11 +91,11 @@ def test_nan_is_unseen_and_boards_may_lack_what_is_unseen():
 def test_views_without_corners_are_left_out(empty):
     image_points = [VIEWS[0], empty, VIEWS[2], VIEWS[3], empty]
     with pytest.warns(UserWarning, match=r"views 1, 4 left out, because") as caught:
-        observations = as_observations([BOARD] * 5, image_points, SIZE, OWNER)
+        observations, layout = as_observations([BOARD] * 5, image_points, SIZE, OWNER)
     assert len(caught) == 1
-    assert observations.views.tolist() == [0, 2, 3]
+    assert layout.views.tolist() == [0, 2, 3]
     same(observations, REPEATED[:3], VIEWS[[0, 2, 3]])
-    back = observations.restore(observations.pixels)
+    back = layout.restore(observations.pixels, observations.seen)
     assert len(back) == 5
     assert back[1].isnan().all()
     assert tuple(back[1].shape) == (np.shape(empty)[0] if empty is not None else 54, 2)
@@ -104,17 +104,17 @@ def test_views_without_corners_are_left_out(empty):
 def test_views_of_different_corners():
     which = [np.arange(54), np.arange(10, 40), np.arange(0, 54, 3)]
     points, image_points = [BOARD[w] for w in which], [VIEWS[i][w][:, None] for i, w in enumerate(which)]
-    observations = as_observations(points, image_points, SIZE, OWNER)
+    observations, layout = as_observations(points, image_points, SIZE, OWNER)
     assert observations.seen.sum(-1).tolist() == [54, 30, 18]
     assert observations.seen.shape == (3, 54)
-    for back, given in zip(observations.restore(observations.pixels), image_points, strict=True):
+    for back, given in zip(layout.restore(observations.pixels, observations.seen), image_points, strict=True):
         torch.testing.assert_close(back, torch.from_numpy(given).double(), rtol=0, atol=0)
-    inliers = observations.restore(observations.seen)
+    inliers = layout.restore(observations.seen, observations.seen)
     assert [tuple(t.shape) for t in inliers] == [(54, 1), (30, 1), (18, 1)]
     points[1] = None
     image_points[1] = None
     with pytest.warns(UserWarning, match="view 1"):
-        assert len(as_observations(points, image_points, SIZE, OWNER).seen) == 2
+        assert len(as_observations(points, image_points, SIZE, OWNER)[0].seen) == 2
 
 
 def changed(index, value):
@@ -173,7 +173,7 @@ def test_what_is_no_points(object_points, image_points, words):
 
 def test_sizes_of_images():
     for size in ((480, 640), [480, 640], np.array([480, 640]), torch.Size(SIZE)):
-        assert as_observations(BOARD, VIEWS, size, OWNER).image_size == SIZE
+        assert as_observations(BOARD, VIEWS, size, OWNER)[1].image_size == SIZE
     with refuses("image_size", "(640, 480)", "is (height, width)"):
         as_observations(BOARD, VIEWS, (640, 480), OWNER)
     with refuses("image_size", "(height, width)", "None", error=TypeError):
@@ -184,7 +184,7 @@ def test_corners_at_the_rim_and_a_few_outliers_are_taken():
     image_points = VIEWS.copy()
     image_points[0, 0] = -3.0  # just outside
     image_points[:, :3] += 300.0  # gross outliers, some of them outside
-    assert as_observations(BOARD, image_points, SIZE, OWNER).seen.all()
+    assert as_observations(BOARD, image_points, SIZE, OWNER)[0].seen.all()
 
 
 MODELS = {"left": "kannala_brandt", "right": "kannala_brandt"}
@@ -200,14 +200,15 @@ def test_cameras_of_a_rig_see_the_same_boards():
     with pytest.warns(UserWarning, match="view 4 left out"):
         found = as_rig_observations(BOARD, points, SIZES, MODELS, OWNER)
     assert list(found) == ["left", "right"]
-    for of in found.values():
-        assert of.points.tolist() == REPEATED[:4].tolist()
-    assert found["left"].seen.sum(-1).tolist() == [54, 54, 53, 54]
-    assert found["right"].seen.sum(-1).tolist() == [0, 54, 54, 54]
-    assert found["right"].image_size == (600, 800)
-    back = found["left"].restore(found["left"].pixels)
+    for observations, _ in found.values():
+        assert observations.points.tolist() == REPEATED[:4].tolist()
+    (left_seen, left_layout), (right_seen, right_layout) = found.values()
+    assert left_seen.seen.sum(-1).tolist() == [54, 54, 53, 54]
+    assert right_seen.seen.sum(-1).tolist() == [0, 54, 54, 54]
+    assert right_layout.image_size == (600, 800)
+    back = left_layout.restore(left_seen.pixels, left_seen.seen)
     torch.testing.assert_close(back, torch.from_numpy(left).double(), rtol=0, atol=0, equal_nan=True)
-    back = found["right"].restore(found["right"].pixels)
+    back = right_layout.restore(right_seen.pixels, right_seen.seen)
     assert [tuple(t.shape) for t in back] == [(54, 2)] * 5
     assert [bool(t.isnan().any()) for t in back] == [True, False, False, False, True]
 
@@ -242,4 +243,4 @@ def test_bad_rigs(changes, words):
 def test_cameras_linked_by_another():
     points = {"a": [*VIEWS[:2], None, None], "b": [None, None, *VIEWS[2:4]], "c": [None, VIEWS[1], VIEWS[2], None]}
     found = as_rig_observations(BOARD, points, dict.fromkeys("abc", SIZE), dict.fromkeys("abc"), OWNER)
-    assert [of.seen.any(-1).sum().item() for of in found.values()] == [2, 2, 2]
+    assert [seen.seen.any(-1).sum().item() for seen, _ in found.values()] == [2, 2, 2]
