@@ -83,6 +83,11 @@ class CameraObservations(NamedTuple):
     weights: Tensor  # (B, V, N) of the squares, 0 for unseen points, whose other numbers are any finite ones
     prior: Prior | None = None
 
+    @classmethod
+    def of_one(cls, model: type[Camera], seen: Observations, prior: Prior | None = None) -> CameraObservations:
+        """Return the observations of one camera, for one problem."""
+        return cls(model, seen.points[None], seen.pixels[None], seen.seen.to(seen.pixels)[None], prior)
+
     def mapped(self, change: Callable[[Tensor], Tensor]) -> CameraObservations:
         """Return the observations with a change applied to all tensors of problems."""
         points, pixels, weights = map(change, self[1:4])
@@ -251,9 +256,6 @@ class Bundle:
         ends = [bounds(camera, p) for camera, p in zip(self.cameras, state.parameters, strict=True)]
         self.low = self._of_shared([low for low, _ in ends], -torch.inf)
         self.high = self._of_shared([high for _, high in ends], torch.inf)
-        # the bound of a focal length only catches failures
-        learning = zip(self.cameras, indices, strict=True)
-        self.is_bounded = any(camera.fit_bounds and max(own, default=0) >= 4 for camera, own in learning)
 
     def _next_places(self, count: int) -> list[int]:
         """Add so many shared unknowns, and return their places."""
@@ -344,13 +346,11 @@ class Bundle:
 
     def linearised(self, flat: Sequence[Tensor], rows: Tensor) -> System:
         equations = self.equations(flat, rows)
-        held = torch.zeros(len(rows), self.shared_width, dtype=torch.bool, device=flat[1].device)
-        if self.is_bounded:
-            # parameters that would leave their bounds stay there, so that the others can move on
-            view, shared = equations.view[..., self.width :], equations.shared
-            slope = (view[..., :-1] * view[..., -1:]).sum((1, 2)) + (shared[..., :-1] * shared[..., -1:]).sum(1)
-            values, low, high = self._of_shared(flat[5:], 0.0), _of_rows(self.low, rows), _of_rows(self.high, rows)
-            held = (values <= low) & (slope > 0) | (values >= high) & (slope < 0)
+        # parameters that would leave their bounds stay there, so that the others can move on
+        view, shared = equations.view[..., self.width :], equations.shared
+        slope = (view[..., :-1] * view[..., -1:]).sum((1, 2)) + (shared[..., :-1] * shared[..., -1:]).sum(1)
+        values, low, high = self._of_shared(flat[5:], 0.0), _of_rows(self.low, rows), _of_rows(self.high, rows)
+        held = (values <= low) & (slope > 0) | (values >= high) & (slope < 0)
         return System(equations, self.width, held)
 
     def equations(self, flat: Sequence[Tensor], rows: Tensor) -> Equations:

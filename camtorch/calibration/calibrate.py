@@ -10,11 +10,12 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from camtorch.calibration.board_poses import Lens, other_poses, poses_for
 from camtorch.calibration.bundle import Adjusted, CameraObservations, Free, Poses, Prior, State, adjust
 from camtorch.calibration.model import Model, asked_model
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
 from camtorch.calibration.robust import Loss, as_loss
-from camtorch.calibration.start import Lens, as_seen, other_cameras, other_poses, poses_for, start_from_nothing
+from camtorch.calibration.start import other_cameras, start_from_nothing
 from camtorch.calibration.uncertainty import shared_factor, spread
 from camtorch.calibration.verdict import Calibration, check_determined
 from camtorch.cameras.camera import Camera
@@ -112,7 +113,7 @@ class Search:
         """The observations for an adjustment, with the prior of a surface that starts from a camera."""
         kind, start, smooth = self.asked.kind, self.asked.start, self.asked.kind.smoothness()
         if start is None or smooth is None:
-            return as_seen(kind, self.centred)
+            return CameraObservations.of_one(kind, self.centred)
         # a surface keeps the start's shape if nothing is seen
         like = self.seen.pixels
         core, coefficients = (t.detach().to(like).reshape(-1) for t in (start.intrinsics, start.distortion))
@@ -125,7 +126,7 @@ class Search:
         # a surface can imitate a turn of the camera, so its frame is held at the start's
         rows = _SMOOTH * float(core[:2].mean()) * smooth.to(like), torch.func.jacrev(frame)(coefficients)
         prior = Prior(torch.cat((core, coefficients)), torch.nn.functional.pad(torch.cat(rows), (4, 0)))
-        return as_seen(kind, self.centred, prior)
+        return CameraObservations.of_one(kind, self.centred, prior)
 
     def free(self, bend: bool = False) -> Free:
         """Return the unknowns of a search for this camera alone; `bend` adds the board's shape."""
