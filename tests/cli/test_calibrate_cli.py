@@ -44,12 +44,12 @@ def photographs(tmp_path_factory):
     second = ct.Extrinsics(TURN, SHIFT)
     for i, (turn, shift) in enumerate(poses(BOARD), 1):
         image, _ = photograph(BOARD, fisheye(), turn.tolist(), shift.tolist(), seed=i)
-        Image.fromarray(image).save(folder / f"{i}.png")
+        Image.fromarray(image).save(folder / f"{i}.png", compress_level=1)
         if i < 5:
             pose = second.compose(ct.Extrinsics(turn, shift))
             of_right = pose.rotation.tolist(), pose.translation.tolist()
             image, _ = photograph(BOARD, right.requires_grad_(False), *of_right, seed=10 + i)
-            Image.fromarray(image).save(folder / "right" / f"{i}.png")
+            Image.fromarray(image).save(folder / "right" / f"{i}.png", compress_level=1)
     return folder
 
 
@@ -75,7 +75,7 @@ def test_a_folder_of_photographs_becomes_a_camera(photographs, capsys):
     Path("6.png").write_text("no image")
     Path("7.png").write_bytes((photographs / "5.png").read_bytes()[:2000])
     with Image.open("1.png") as image:
-        image.resize((480, 360)).save("8.png")
+        image.resize((480, 360)).save("8.png", compress_level=1)
     Path("9.png").write_bytes(Path("3.png").read_bytes())
     calibrate(".", "none.png", *WORDS, "-o", "camera.yml")
     captured = capsys.readouterr()

@@ -76,7 +76,7 @@ def test_a_photograph_is_kept_at_a_moderate_size(kind, tmp_path):
     image = np.zeros((2400, 3200, 3), np.uint8)
     image[:, ::2] = 255
     if kind == "path":
-        Image.fromarray(image).save(tmp_path / "photo.png")
+        Image.fromarray(image).save(tmp_path / "photo.png", compress_level=1)
     given = {"path": str(tmp_path / "photo.png"), "array": image, "tensor": torch.from_numpy(image).movedim(-1, 0)}
     text = viewer.page(camera, given.get(kind, image[..., 0]))
     data = json.loads(text.split('id="data">')[1].split("</script>")[0])
