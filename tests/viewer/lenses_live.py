@@ -12,7 +12,7 @@ from camtorch.viewer.viewer import models
 
 KEYS = sorted(models())
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-SIDE = 15
+SIDE = 11
 # in JavaScript: the results of lenses as `asked` describes them
 ANSWERS = """(lenses) => lenses.map(({ model, intrinsics, distortion, pixels, points }) => {
   const camera = new Formulas.Camera(model, intrinsics, distortion);
