@@ -70,7 +70,7 @@ CASES, FEW = list(product(LENSES, AUGMENTATIONS, DTYPES)), {"mount", "chain", "e
 def test_as_step_by_step(key, name, dtype):
     camera = example(key, SIZE).to(dtype).requires_grad_(False)
     augment, sample = AUGMENTATIONS[name](), sample_for(dtype)
-    for seed in range(3):
+    for seed in range(2):  # as a first and as a later sample
         torch.manual_seed(seed)
         out = augment(sample, camera=camera)
         change, fill = augment.last, augment.mask_fill
