@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+import itertools
 
 import numpy as np
 import pytest
@@ -154,9 +155,11 @@ def test_all_fields_move_as_by_the_native_call(front_end, name, batch, monkeypat
 
 
 @pytest.mark.filterwarnings("ignore:.*will show nothing")
-@pytest.mark.parametrize("name", ["mount", "filled", "a box", *EDITS])
 @pytest.mark.parametrize("front_end", FRONT_ENDS)
-@pytest.mark.parametrize("key", ["K", "intrinsics", None])
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [("mount", "intrinsics"), *itertools.product(("mount", "filled", "a box", *EDITS), ("K", None))],
+)
 def test_a_matrix_or_a_number_stands_for_the_camera(front_end, key, name, monkeypatch):
     kornia = front_end == "kornia"
     if kornia and name == "a box":

@@ -174,7 +174,7 @@ def views():
 
 def test_paths_and_arrays_give_the_same_and_calibrate(views, tmp_path):
     for i, (image, _) in enumerate(views):
-        Image.fromarray(image).save(tmp_path / f"view{i}.png")
+        Image.fromarray(image).save(tmp_path / f"view{i}.png", compress_level=1)
     Image.fromarray(np.full((480, 640), 90, np.uint8)).save(tmp_path / "view3.png")
     with pytest.warns(UserWarning, match=r"1 of 4 images are left out: .*view3.png \(no board found\)"):
         found = ct.find_board(str(tmp_path / "*.png"), "9x6", square=0.03)
