@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import typing
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, cast
@@ -37,9 +38,11 @@ from camtorch.values.arguments import Numbers, broadcast_shapes, hinting, warn
 from camtorch.values.module import GeometryModule, typed_as
 
 if TYPE_CHECKING:
-    from typing_extensions import TypeVar  # which has defaults on each Python; checkers of types bring it
+    from typing_extensions import TypeVar  # with a default; checkers of types bring it
 
     Model = TypeVar("Model", bound="Camera", default="Camera")
+else:
+    Model = typing.TypeVar("Model", bound="Camera")  # Python 3.11 has no defaults
 
 
 MODELS: Catalogue[type[Camera]] = Catalogue()

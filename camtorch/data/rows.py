@@ -55,9 +55,9 @@ class Mover:
             own = Always(transform, owner, self._fields)
         else:
             raise TypeError(f"{owner}: transform must be an augmentation or a Warp; got {type(transform).__name__}")
-        self._transform = Transform(own)
+        self._fixed = Transform(own)  # by this name in pickles of 0.5
         draws = isinstance(transform, Augmentation)
-        self._seeded = Seeded(self._transform, seed=seed, epoch=epoch) if draws else None
+        self._seeded = Seeded(self._fixed, seed=seed, epoch=epoch) if draws else None
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the draws; copies that workers and engines already have are not changed."""
@@ -73,7 +73,7 @@ class Mover:
             if camera is not None:
                 fields["camera"] = camera if isinstance(camera, Camera) else self._camera(camera, fields)
             if self._seeded is None:
-                return self._transform(fields)
+                return self._fixed(fields)
             return self._seeded(fields, key=key)  # type: ignore[arg-type]
         except (ValueError, TypeError) as error:
             which = "" if key is None else f"sample {key!r:.200}: "
