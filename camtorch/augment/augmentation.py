@@ -37,13 +37,13 @@ from camtorch.warp.views import place_of
 from camtorch.warp.warp import Warp
 
 
-class FlipOptions(SampleOptions, total=False):
+class OptionsBesideP(SampleOptions, total=False):
     """Options of flips, which have a `p` of their own; see `Augmentation`."""
 
     same_on_batch: bool
 
 
-class EditOptions(FlipOptions, total=False):
+class AugmentationOptions(OptionsBesideP, total=False):
     """The options that all augmentations have in common; see `Augmentation`."""
 
     p: float

@@ -6,7 +6,7 @@ from typing import Unpack
 import torch
 from torch import Tensor
 
-from camtorch.augment.augmentation import Augmentation, EditOptions
+from camtorch.augment.augmentation import Augmentation, AugmentationOptions
 from camtorch.augment.ranges import TURN, RangeLike, as_range
 from camtorch.cameras.camera import Camera
 from camtorch.poses.rotations import mount_rotation
@@ -58,7 +58,7 @@ class BoxCrop(Augmentation):
         pitch: RangeLike | None = None,
         roll: RangeLike | None = None,
         zoom: RangeLike | None = None,
-        **options: Unpack[EditOptions],
+        **options: Unpack[AugmentationOptions],
     ):
         name = type(self).__name__
         turns = {"yaw": yaw, "pitch": pitch, "roll": roll}

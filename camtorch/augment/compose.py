@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from camtorch.augment.augmentation import Augmentation, EditOptions
+from camtorch.augment.augmentation import Augmentation, AugmentationOptions
 from camtorch.augment.change import Change, check_sizes
 from camtorch.augment.edits import Edit, change_by
 from camtorch.augment.landmarks import Mirroring
@@ -57,7 +57,7 @@ class Compose(Augmentation):
     augmentations: nn.ModuleList
     _chooses_antialias = True
 
-    def __init__(self, augmentations: Iterable[Augmentation], **options: Unpack[EditOptions]):
+    def __init__(self, augmentations: Iterable[Augmentation], **options: Unpack[AugmentationOptions]):
         name = type(self).__name__
         parts = list(augmentations) if isinstance(augmentations, Iterable) else [augmentations]
         for part in parts:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Unpack
 import torch
 from torch import Tensor
 
-from camtorch.augment.augmentation import Augmentation, EditOptions
+from camtorch.augment.augmentation import Augmentation, AugmentationOptions
 from camtorch.augment.devices import twin_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.jitter import jittered
@@ -54,7 +54,7 @@ _AUTO = "focal", "centre", "distortion", "crop"  # ranges that "auto" may stand 
 _REAL_LENS = KannalaBrandt([1.0, 1.0, 0.0, 0.0]).detach()  # of the model of real lenses, with other numbers
 
 
-class LensOptions(EditOptions, total=False):
+class LensOptions(AugmentationOptions, total=False):
     """Options that `RandomMount`, `RandomLens` and `RandomCamera` have in common; see `RandomCamera`."""
 
     min_filled: float | None
@@ -92,7 +92,7 @@ class CameraDrawer(Augmentation):
         cos4: RangeLike | None = None,
         image_size: Sequence[int] | None = None,
         min_filled: float | None = None,
-        **options: Unpack[EditOptions],
+        **options: Unpack[AugmentationOptions],
     ):
         super().__init__(min_filled=min_filled, **options)
         self._memo = Kept(8)

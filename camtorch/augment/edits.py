@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from camtorch.augment.augmentation import Augmentation, EditOptions, FlipOptions
+from camtorch.augment.augmentation import Augmentation, AugmentationOptions, OptionsBesideP
 from camtorch.augment.change import Change, by_models
 from camtorch.augment.landmarks import Mirroring, TableLike
 from camtorch.augment.part import Part
@@ -42,7 +42,7 @@ class Edit(Augmentation):
             `Augmentation`.
     """
 
-    def __init__(self, ranges: Mapping[str, Range] | None = None, **options: Unpack[EditOptions]):
+    def __init__(self, ranges: Mapping[str, Range] | None = None, **options: Unpack[AugmentationOptions]):
         options.setdefault("antialias", None)
         super().__init__(ranges, min_filled=0, **options)  # only pixels that the caller asks for are empty
 
@@ -156,7 +156,7 @@ class RandomResizedCrop(Edit):
         *,
         scale: Sequence[float] = (0.08, 1.0),
         ratio: Sequence[float] = (3 / 4, 4 / 3),
-        **options: Unpack[EditOptions],
+        **options: Unpack[AugmentationOptions],
     ):
         name = type(self).__name__
         ratios = as_range(ratio, "ratio", name, least=1e-3, most=1e3, is_pair=True)
@@ -188,7 +188,7 @@ class RandomCrop(Edit):
 
     image_size: tuple[int, int]
 
-    def __init__(self, size: Size, **options: Unpack[EditOptions]):
+    def __init__(self, size: Size, **options: Unpack[AugmentationOptions]):
         super().__init__({"place": Range(0, 1, 2)}, **options)
         self.image_size = _as_size(size, self._name)
 
@@ -210,7 +210,7 @@ class CenterCrop(Edit):
 
     image_size: tuple[int, int]
 
-    def __init__(self, size: Size, **options: Unpack[EditOptions]):
+    def __init__(self, size: Size, **options: Unpack[AugmentationOptions]):
         super().__init__(**options)
         self.image_size = _as_size(size, self._name)
 
@@ -229,7 +229,7 @@ class Resize(Edit):
 
     shorter: int | None
 
-    def __init__(self, size: Size, **options: Unpack[EditOptions]):
+    def __init__(self, size: Size, **options: Unpack[AugmentationOptions]):
         super().__init__(**options)
         alone = size[0] if isinstance(size, Sequence) and len(size) == 1 else size  # torchvision's (256,) is 256
         self.shorter = None if isinstance(alone, Sequence) else as_whole(alone, "size", self._name, least=1)
@@ -255,7 +255,9 @@ class Pad(Edit):
 
     least: tuple[int, int] | None
 
-    def __init__(self, padding: Size | None = None, *, size: Size | None = None, **options: Unpack[EditOptions]):
+    def __init__(
+        self, padding: Size | None = None, *, size: Size | None = None, **options: Unpack[AugmentationOptions]
+    ):
         super().__init__(**options)
         if (padding is None) == (size is None):
             raise TypeError(f"{self._name}: either padding or size must be given; got {padding!r} and {size!r}")
@@ -293,7 +295,7 @@ class Rotate90(Edit):
 
     times: tuple[int, int, int]
 
-    def __init__(self, times: int | Sequence[int] = (0, 3), *, step: int = 1, **options: Unpack[EditOptions]):
+    def __init__(self, times: int | Sequence[int] = (0, 3), *, step: int = 1, **options: Unpack[AugmentationOptions]):
         name = type(self).__name__
         given = times if isinstance(times, Sequence) else (times, times)
         ends = tuple(as_whole(end, "times", name) for end in given)
@@ -327,7 +329,7 @@ class _Flip(Edit):
         landmarks: TableLike | Mapping[str, TableLike | None] | None = None,
         lateral_axis: str = "x",
         swap_sides: bool = True,
-        **options: Unpack[FlipOptions],
+        **options: Unpack[OptionsBesideP],
     ):
         super().__init__(p=p, **options)
         self.mirroring: Mirroring | None = Mirroring(landmarks, lateral_axis, swap_sides, self._name)

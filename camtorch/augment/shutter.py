@@ -4,7 +4,7 @@ from typing import ClassVar, Unpack
 
 import torch
 
-from camtorch.augment.augmentation import Augmentation, EditOptions
+from camtorch.augment.augmentation import Augmentation, AugmentationOptions
 from camtorch.augment.part import Part
 from camtorch.augment.ranges import Draw, RangeLike, as_range, as_tensors, values_for
 from camtorch.cameras.camera import Camera
@@ -34,7 +34,12 @@ class RandomShutter(Augmentation):
     keeps_lens: ClassVar[bool] = True
 
     def __init__(
-        self, readout: RangeLike, rates: RangeLike, *, direction: Direction = "down", **options: Unpack[EditOptions]
+        self,
+        readout: RangeLike,
+        rates: RangeLike,
+        *,
+        direction: Direction = "down",
+        **options: Unpack[AugmentationOptions],
     ):
         name = type(self).__name__
         readout = (readout, readout) if isinstance(readout, (int, float)) else readout
