@@ -65,18 +65,23 @@ class HalvingWarp(Warp):
     def warped(self, images: Tensor, sampler: Sampler, route: Route | None = None) -> Tensor:
         """Return warped images; each one may be copied, resized, or halved and sampled, see `ImageEdit`."""
         smooth = sampler.mode != "nearest" and images.dtype != torch.bool
-        called = torch.compiler.is_compiling() and not torch.onnx.is_in_onnx_export()
-        if called and self._edits_need_values(smooth) and not keeps_graph(images, *self.tensors):
-            options = self.antialias, sampler.padding_mode, sampler
+        may_call = torch.compiler.is_compiling() and not torch.onnx.is_in_onnx_export()
+        if may_call and self._edits_need_values(smooth) and not keeps_graph(images, *self.tensors):
             matrix = None if self.map is None else map_as_tensor(self.map)
-            return compiled.warped(images, self.pair, self.tolerance, *options, matrix, _edited)
+            padding = sampler.padding_mode
+            return compiled.warped(images, self.pair, self.tolerance, self.antialias, padding, sampler, matrix, _edited)
         route = route or self.route(images)
         edits = None if in_transform() else self._edits(sampler, smooth, route)
         if not edits:
             return super().warped(images, sampler, route)
-        images = images.expand(len(edits), -1, -1, -1) if len(edits) > 1 else images
+        if len(edits) > 1:
+            images = images.expand(len(edits), -1, -1, -1)
         if all(edit == edits[0] for edit in edits):
             return self._made(images, edits[0], sampler, route)
+        return self._made_by_several(images, edits, sampler, route)
+
+    def _made_by_several(self, images: Tensor, edits: list[ImageEdit], sampler: Sampler, route: Route) -> Tensor:
+        """Return images, each made by its own edit; those of one edit are sampled together."""
         result = self._empty(images)
         for edit in dict.fromkeys(edits):
             rows = [i for i, other in enumerate(edits) if other == edit]

@@ -108,22 +108,22 @@ class CropsWarp(Warp):
 
     def transform_points(self, pixels: Numbers) -> tuple[Tensor, Tensor]:
         """Move pixels (B, F, *N, 2); see `Warp.transform_points`."""
-        return self._by_rows(self.by_rows.transform_points, pixels, "pixels")
+        return self._rowwise(self.by_rows.transform_points, pixels, "pixels")
 
     def transform_boxes(self, boxes: Numbers) -> tuple[Tensor, Tensor]:
         """Move boxes (B, F, *N, 4); see `Warp.transform_boxes`."""
-        return self._by_rows(self.by_rows.transform_boxes, boxes, "boxes")
+        return self._rowwise(self.by_rows.transform_boxes, boxes, "boxes")
 
     def enclose(self, corners: Tensor) -> tuple[Tensor, Tensor]:
         """Move closed polygons (B, F, *N, K, 2); see `Warp.enclose`."""
-        return self._by_rows(self.by_rows.enclose, corners, "corners")
+        return self._rowwise(self.by_rows.enclose, corners, "corners")
 
     def transform_rays(self, rays: Numbers) -> Tensor:
         """Turn directions (B, F, *N, 3); see `Warp.transform_rays`."""
-        turned: Tensor = self._by_rows(lambda rows: (self.by_rows.transform_rays(rows),), rays, "rays")[0]
+        turned: Tensor = self._rowwise(lambda rows: (self.by_rows.transform_rays(rows),), rays, "rays")[0]
         return turned
 
-    def _by_rows(self, move: Callable[[Tensor], tuple[Tensor, ...]], values: Numbers, name: str) -> tuple[Any, ...]:
+    def _rowwise(self, move: Callable[[Tensor], tuple[Tensor, ...]], values: Numbers, name: str) -> tuple[Any, ...]:
         """Return the results of `move` for values with the leading dims (B, F), with these dims."""
         values, batch = as_values(values, name, "Warp", self.source.intrinsics.device), self.batch_shape
         if values.shape[:2] != batch or values.ndim < 3:

@@ -328,16 +328,15 @@ def looking_at(
 
     camera: a single one, or one for each box, with one batch dim. Derivatives go to the boxes.
     """
-    learns = keeps_graph(boxes) or has_tangent(boxes)
-    farthest, rotation, touching = _outermost(camera, boxes, margin, owner, learns)
-    if touching is not None:
+    with torch.no_grad():
+        middles, corners = _middles_and_corners(boxes.detach(), margin)
+        rotation = _rotation_to(_checked_axes(camera, boxes, middles, owner))
+        farthest, edges, shares = _outermost(camera, corners, rotation, boxes, owner)
+    if keeps_graph(boxes) or has_tangent(boxes):
         # the largest slope of all has the derivative of the slope at the point that has it
         camera = camera.detach() if keeps_graph(*camera.tensors) else camera
-        low, high = boxes.reshape(-1, 4).double().split(2, -1)
-        rotation = _rotation_to(camera.unproject((low + high) / 2)[0])
-        moved = margin * (high - low)
-        edges, shares = touching
-        corners = corners_of(torch.cat((low - moved, high + moved), -1))
+        middles, corners = _middles_and_corners(boxes, margin)
+        rotation = _rotation_to(camera.unproject(middles)[0])
         rows = torch.arange(len(corners), device=corners.device)[:, None]
         start, end = corners[rows, edges], corners[rows, (edges + 1) % 4]
         rays = camera.unproject(start + shares[..., None] * (end - start))[0] @ rotation.mT
@@ -356,33 +355,41 @@ def _rotation_to(axis: Tensor) -> Tensor:
     return torch.stack((across, torch.linalg.cross(axis, across), axis), -2)
 
 
-@torch.no_grad()
-def _outermost(
-    camera: Camera, boxes: Tensor, margin: float, owner: str, learns: bool
-) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
-    """Return the largest slopes (B, 2) of the outlines of boxes in the cameras of `look_at`, and their rotations.
+def _middles_and_corners(boxes: Tensor, margin: float) -> tuple[Tensor, Tensor]:
+    """Return the middles (B, 2) of boxes (*B, 4), and their corners (B, 4, 2) with the margin, in float64."""
+    low, high = boxes.reshape(-1, 4).double().split(2, -1)
+    moved = margin * (high - low)
+    return (low + high) / 2, corners_of(torch.cat((low - moved, high + moved), -1))
 
-    And, if the boxes learn, where they are, (B, 2) each: the edge, and the share of it from its start.
-    """
+
+def _checked_axes(camera: Camera, boxes: Tensor, middles: Tensor, owner: str) -> Tensor:
+    """Return the rays (B, 3) of the middles of boxes; raise if one of these is none, or no camera can look at it."""
     check_boxes(boxes, "boxes", owner)
     _refuse(~torch.isfinite(boxes).all(-1), boxes, "be finite", owner)
     _refuse(~(boxes[..., :2] < boxes[..., 2:]).all(-1), boxes, "have a width and a height: x1 < x2 and y1 < y2", owner)
     limits = boxes.new_tensor((camera.width, camera.height)) - 0.5
     is_shown = ((boxes[..., :2] < limits) & (boxes[..., 2:] > -0.5)).all(-1)
     _refuse(~is_shown, boxes, f"be on the image, {camera.width} x {camera.height}, in part", owner)
-    low, high = boxes.detach().reshape(-1, 4).double().split(2, -1)
-    axis, has_ray = camera.unproject((low + high) / 2)
+    axes, has_ray = camera.unproject(middles)
     _refuse(~has_ray, boxes, "have a middle that the lens sees", owner)
     what = "lie off the camera's y axis, along which no direction is up"
-    _refuse(axis[:, ::2].norm(dim=-1) < _STRAIGHT_UP * axis.norm(dim=-1), boxes, what, owner)
-    rotation = _rotation_to(axis)
-    moved = margin * (high - low)
-    corners = corners_of(torch.cat((low - moved, high + moved), -1))
+    _refuse(axes[:, ::2].norm(dim=-1) < _STRAIGHT_UP * axes.norm(dim=-1), boxes, what, owner)
+    return axes
+
+
+def _outermost(
+    camera: Camera, corners: Tensor, rotation: Tensor, boxes: Tensor, owner: str
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the largest slopes x / z and y / z (B, 2) of outlines (B, 4, 2), turned by rotations (B, 3, 3).
+
+    And where on the outlines they are, (B, 2) each: the edge, and the share of it from its start. Errors name `boxes`.
+    """
     start, edge = corners[:, :, None, None], (corners.roll(-1, 1) - corners)[:, :, None, None]
-    # find the largest slopes x / z and y / z along each edge, in smaller and smaller steps
-    steps = torch.linspace(-1, 1, _EDGE_SAMPLES, dtype=low.dtype, device=low.device)
-    place, half, all_seen = low.new_full((len(low), 4, 1), 0.5), 0.5, True
-    farthest = low.new_full((len(low), 2), -math.inf)
+    steps = torch.linspace(-1, 1, _EDGE_SAMPLES, dtype=corners.dtype, device=corners.device)
+    farthest = corners.new_full((len(corners), 2), -math.inf)
+    # along each edge, in smaller and smaller steps around the farthest sample
+    place, half = corners.new_full((len(corners), 4, 1), 0.5), 0.5
+    all_seen = True
     for i in range(_MORE_ROUNDS):
         share = (place[..., None] + half * steps).clamp(0, 1)  # (B, 4, 1 or 2, K)
         rays, seen = camera.unproject((start + share[..., None] * edge).flatten(1, 3))
@@ -395,14 +402,10 @@ def _outermost(
         slopes = slopes.expand(-1, -1, 2, -1, -1).diagonal(dim1=2, dim2=4).mT  # (B, 4, 2, K)
         best, index = slopes.max(-1)
         farthest = torch.maximum(farthest, best.amax(1))
-        is_last = i == _MORE_ROUNDS - 1 or (i == _ROUNDS - 1 and all_seen)
-        if is_last and not learns:
-            break
-        place, half = share.expand(*best.shape, -1).gather(-1, index[..., None])[..., 0], 2 * half / (_EDGE_SAMPLES - 1)
-        if is_last:
+        place = share.expand(*best.shape, -1).gather(-1, index[..., None])[..., 0]
+        half = 2 * half / (_EDGE_SAMPLES - 1)
+        if i == _ROUNDS - 1 and all_seen:
             break
     _refuse(~torch.isfinite(farthest).all(-1), boxes, "have an outline that the lens sees", owner)
-    if not learns:
-        return farthest, rotation, None
     edges = best.argmax(1)
-    return farthest, rotation, (edges, place.gather(1, edges[:, None])[:, 0])
+    return farthest, edges, place.gather(1, edges[:, None])[:, 0]
