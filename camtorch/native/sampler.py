@@ -47,8 +47,8 @@ def takes(dtype: torch.dtype, mode: Mode) -> bool:
     return (mode == "nearest" or dtype in _TYPES) and MODES[mode].code >= 0
 
 
-class Call:
-    """A call of the sampler, ready for images of one form and positions that stay; threads may share it after one call.
+class NativeJob:
+    """A job of the sampler, ready for images of one form and positions that stay; threads may share it after one call.
 
     All tensors are on the CPU and without a graph. Images (B, C, H, W) and results (B, C, h, w) are of one dtype, which
     `takes` knows, and may have any strides. `fill` has C values, of pixels that show nothing, which "zeros" blends in;
@@ -126,7 +126,7 @@ def _copied(images: Tensor, layout: torch.memory_format) -> Tensor:
 
 
 def describe(job: structs.Job, images: Tensor, result: Tensor, mode: Mode, padding: str, fill: Sequence[float]) -> None:
-    """Write into a job what arguments of `Call` have in common: all but images and positions."""
+    """Write into a job what arguments of `NativeJob` have in common: all but images and positions."""
     job.source_strides[:], job.result_strides[:] = images.stride(), result.stride()
     job.count, job.channels, job.height, job.width = result.shape
     job.source_height, job.source_width = images.shape[-2:]
@@ -191,7 +191,7 @@ def maker(images: Tensor, count: int, size: tuple[int, int]) -> Callable[[], Ten
 def lay(nodes: Tensor, cells: Tensor, exact: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Return positions (B, h, w, 2) of all pixels of a lattice, -9 if there is none; and bool (B, h, w).
 
-    It is as in `Call`, and `cells` may be `CELL_QUINTIC`.
+    It is as in `NativeJob`, and `cells` may be `CELL_QUINTIC`.
     """
     shape = cells.shape[0], *size
     grid = memory.empty((*shape, 2), torch.float32, torch.contiguous_format)

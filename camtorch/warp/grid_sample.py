@@ -52,7 +52,9 @@ def _on_cpu(images: Tensor, grid: Tensor, mode: Mode, padding_mode: PaddingMode)
     """Sample on a CPU with work for every thread; grid_sample gives one thread to each image."""
     if padding_mode == "zeros" and is_sampled_natively(images, grid, mode):
         at = grid[:1] if grid.stride(0) == 0 else grid
-        call = sampler.Call(images, (grid.shape[1], grid.shape[2]), mode, "zeros", [0.0] * images.shape[1], grid=at)
+        call = sampler.NativeJob(
+            images, (grid.shape[1], grid.shape[2]), mode, "zeros", [0.0] * images.shape[1], grid=at
+        )
         return call(images)
     threads = torch.get_num_threads()
     if len(images) >= threads:

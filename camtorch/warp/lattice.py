@@ -66,7 +66,7 @@ class PixelPositions(NamedTuple):
         return self.grid.detach().movedim(-1, 1)[..., first::step, first::step]
 
     def for_native(self, padding: str) -> dict[str, Any]:
-        """Return the positions as `native.sampler.Call` takes them."""
+        """Return the positions as `native.sampler.NativeJob` takes them."""
         # in "zeros" positions far outside say that there is none
         return {"grid": self.grid.detach(), "mapped": None if padding == "zeros" else self.mapped}
 
@@ -109,7 +109,7 @@ class Lattice:
         return self.nodes[..., 2 + first // STEP : -3 : step // STEP, 2 + first // STEP : -3 : step // STEP]
 
     def for_native(self, _: str) -> dict[str, Any]:
-        """Return the lattice as `native.sampler.Call` takes it, in float32."""
+        """Return the lattice as `native.sampler.NativeJob` takes it, in float32."""
         # not cached in float32: only the garbage collector frees an object that holds itself
         found = self if self.nodes.dtype == torch.float32 else self._narrowed
         return {"nodes": found.nodes, "cells": found.cells, "exact": found.exact}

@@ -35,7 +35,7 @@ from camtorch.evaluate.door import (
 from camtorch.evaluate.export import with_values
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import is_unknown
-from camtorch.native.sampler import Call, maker
+from camtorch.native.sampler import NativeJob, maker
 from camtorch.projection.evaluation import native_forms
 from camtorch.projection.native_cameras import Native
 from camtorch.values.arguments import Numbers, broadcast_shapes
@@ -71,7 +71,7 @@ class KeptPositions:
     def __init__(self, pinned: Positions | None = None, paddings: Sequence[PaddingMode] = ()):
         """Keep positions by the padding that they serve; `pinned` ones, of these `paddings`, stay if cameras change."""
         self.is_pinned = pinned is not None
-        self.calls: dict[tuple[object, ...], Call] = {}
+        self.calls: dict[tuple[object, ...], NativeJob] = {}
         self.halvings: list[int] | None = None  # how often a `HalvingWarp` halves the image of each camera, once asked
         self._found: dict[str, Positions] = {} if pinned is None else dict.fromkeys(paddings, pinned)
 
@@ -85,7 +85,7 @@ class KeptPositions:
                 found = self._found[padding] = compute()
         return found
 
-    def keep(self, call: Call, form: tuple[object, ...], where: Positions) -> None:
+    def keep(self, call: NativeJob, form: tuple[object, ...], where: Positions) -> None:
         """Keep the call for images of a form if its positions are kept."""
         if any(where is each for each in self._found.values()):
             if len(self.calls) >= _MOST_CALLS:
@@ -287,7 +287,7 @@ class RoutedWarp(GeometryModule):
         inputs = *images, *self.tensors
         return all(t.is_cpu for t in inputs) and not keeps_graph(*inputs)
 
-    def ready(self, images: object, mode: str | None, padding: str | None) -> Call | None:
+    def ready(self, images: object, mode: str | None, padding: str | None) -> NativeJob | None:
         """Return the call that an earlier one has left for images of this form, if nothing has changed since."""
         known: KeptPositions | None = self._kept.result
         if known is None or not known.calls or not isinstance(images, Tensor):

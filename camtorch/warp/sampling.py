@@ -45,7 +45,7 @@ def laid_as(images: Tensor, result: Tensor) -> Tensor:
     return result.contiguous(memory_format=torch.channels_last)
 
 
-def prepared(images: Tensor, where: Positions, how: Sampler) -> sampler.Call | None:
+def prepared(images: Tensor, where: Positions, how: Sampler) -> sampler.NativeJob | None:
     """Return the call of native code for images (B or 1, C, H, W) of this form.
 
     None with a graph, a transform, another device or dtype, or antialiasing.
@@ -56,7 +56,7 @@ def prepared(images: Tensor, where: Positions, how: Sampler) -> sampler.Call | N
         return None
     fill = fill * images.shape[1] if len(fill) == 1 else fill
     images = images if len(like) == 1 else images.expand(len(like), -1, -1, -1)
-    return sampler.Call(images, where.size, mode, padding_mode, fill, **where.for_native(padding_mode))
+    return sampler.NativeJob(images, where.size, mode, padding_mode, fill, **where.for_native(padding_mode))
 
 
 def by_torch(images: Tensor, where: Positions, how: Sampler, pyramids: dict[int, Pyramid] | None = None) -> Tensor:

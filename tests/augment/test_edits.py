@@ -320,7 +320,7 @@ def test_a_chain_is_one_resampling(monkeypatch):
 
         return call
 
-    call = camtorch.native.sampler.Call
+    call = camtorch.native.sampler.NativeJob
     for module, name in ((call, "__call__"), (sampling, "_within_memory"), (at_once.SampleCall, "__call__")):
         monkeypatch.setattr(module, name, watched(getattr(module, name)))
     mixture()(image=torch.randint(0, 256, (4, 3, 96, 128), dtype=torch.uint8), camera=lens)

@@ -41,8 +41,8 @@ def counted():
     """How often the native sampler was called."""
     calls = []
     with pytest.MonkeyPatch.context() as patch:
-        original = sampler.Call.__call__
-        patch.setattr(sampler.Call, "__call__", lambda *a, **k: calls.append(1) or original(*a, **k))
+        original = sampler.NativeJob.__call__
+        patch.setattr(sampler.NativeJob, "__call__", lambda *a, **k: calls.append(1) or original(*a, **k))
         yield calls
 
 
