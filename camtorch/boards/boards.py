@@ -116,7 +116,8 @@ def as_board(board: Any, square: float, options: dict[str, Any], owner: str) -> 
             f'{owner}: board must be "9x6" (inner corners of a chessboard), "charuco 5x7" or "aprilgrid 6x6"; got '
             f"{shown(board)}"
         )
-    if (kind := BOARDS.get(match[1] or "chessboard")) is None:
+    kind = BOARDS.get(match[1] or "chessboard")
+    if kind is None:
         raise ValueError(f"{owner}: a board's type must be one of {', '.join(BOARDS)}; got {match[1]!r}")
     known = [field.name for field in fields(kind)][3:]
     if strange := sorted(set(options) - set(known)):

@@ -126,7 +126,8 @@ def _to_nearest(pixels: Pixels) -> Pixels:
 
 def _dictionary(cv2: Any, name: str) -> Any:
     known = {key[5:].lower(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
-    if (key := known.get(name.lower().removeprefix("dict_"))) is None:
+    key = known.get(name.lower().removeprefix("dict_"))
+    if key is None:
         raise ValueError(f"board: dictionary must be one of {', '.join(sorted(known))}; got {name!r}")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, key))
 

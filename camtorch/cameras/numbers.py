@@ -70,7 +70,8 @@ def check_fast(model: type[CameraLike], intrinsics: Any, distortion: Any, size: 
     """
     if not (model.always_defined and are_free(*[value for value in (intrinsics, distortion) if type(value) is Tensor])):
         return None
-    if (given := _plain_rows(intrinsics, _MOST_SUM)) is None:
+    given = _plain_rows(intrinsics, _MOST_SUM)
+    if given is None:
         return None
     numbers, rows = given
     if distortion is None and not model.default_count:

@@ -80,7 +80,8 @@ def one(path: Path, rig: Rig, name: str | None = None) -> Camera:
     if name is None and len(rig.cameras) > 1:
         raise ValueError(f"{path}: must have one camera; got several. Choose one with --name: {', '.join(rig.cameras)}")
     name = name or next(iter(rig.cameras))
-    if (camera := rig.camera_of(name)).batch_shape:
+    camera = rig.camera_of(name)
+    if camera.batch_shape:
         raise ValueError(f"{path}: {name} must be one camera; got a batch of {tuple(camera.batch_shape)}")
     return camera
 

@@ -104,7 +104,8 @@ def to_make(pairs: Sequence[Pair], others: Iterable[Path], *, resume: bool, forc
     read = {_key(path): path for path in (*(source for source, _ in pairs), *others)}
     written: dict[str, Path] = {}
     for source, target in pairs:
-        if (place := _key(target)) in written:
+        place = _key(target)
+        if place in written:
             raise ValueError(f"{written[place]} and {source} would both be written to {target}")
         if place in read:
             raise ValueError(f"{target}: would overwrite {read[place]}, which is read. Name another folder")

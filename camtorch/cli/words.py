@@ -41,7 +41,8 @@ def size(text: str) -> tuple[int, int]:
 
 def board(text: str) -> tuple[int, int]:
     """Return (columns, rows) of "COLUMNSxROWS"."""
-    if not (counts := re.fullmatch(r"([0-9]{1,4})[xX]([0-9]{1,4})", text)):
+    counts = re.fullmatch(r"([0-9]{1,4})[xX]([0-9]{1,4})", text)
+    if not counts:
         raise _WrongWord(f"must be COLUMNSxROWS, as in 9x6; got {text!r}")
     return int(counts[1]), int(counts[2])
 

@@ -57,7 +57,8 @@ def fit(
         slopes: (C, 4) the focal lengths at the axis in x and y, and the pixel of the axis.
         fixed: (4 + n,) values of parameters that are held, NaN for those to find.
     """
-    if (smooth := camera.smoothness()) is not None:
+    smooth = camera.smoothness()
+    if smooth is not None:
         return _fit_linear(camera, observations, slopes, smooth.to(slopes), fixed)
     results, scores = [], []
     tiny = _NEARLY_NOTHING**2 * observations.weights.sum(-1)
@@ -162,7 +163,8 @@ def _cost(camera: CameraLike, observations: RayPixels, parameters: Tensor) -> Te
     seen = to_sensor(camera, parameters[:, 4:], observations.rays)
     lost = (~seen.covered & (observations.weights > 0)).any(-1)
     cost = _residuals(observations, parameters, seen).square().sum((1, 2))
-    if (defined := camera.defined(parameters[:, 4:].unbind(-1))) is not None:
+    defined = camera.defined(parameters[:, 4:].unbind(-1))
+    if defined is not None:
         lost = lost | ~(defined > 0)
     return torch.where(lost | ~torch.isfinite(cost), torch.inf, cost)
 

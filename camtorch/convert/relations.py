@@ -19,7 +19,8 @@ def default_count(model: Model, source: CameraLike, models: Models) -> int:
     """Return the least number of coefficients, from the default on, that holds most of a related camera's."""
     if isinstance(source, model):
         return len(source.distortion_names)
-    if (steps := _path(type(source), model, models)) is None:
+    steps = _path(type(source), model, models)
+    if steps is None:
         return model.fit_counts[0] if model.fit_counts else model.default_count
     needed = {_carried(source, name, steps)[0] for name in source.distortion_names}
     named = {n: model.names_of(n) for n in range(model.default_count, _MOST_COEFFICIENTS)}
@@ -31,7 +32,8 @@ def carry_over(
     source: CameraLike, values: Tensor, model: Model, names: tuple[str, ...], models: Models
 ) -> tuple[Tensor, Tensor] | None:
     """Return `values` as coefficients (C, n) of a related model, and whether none is lost (C,); None if unrelated."""
-    if (steps := _path(type(source), model, models)) is None:
+    steps = _path(type(source), model, models)
+    if steps is None:
         return None
     result = values.new_tensor(model.ideal(len(names))).repeat(len(values), 1)
     lossless = torch.ones(len(values), dtype=torch.bool, device=values.device)

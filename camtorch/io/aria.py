@@ -30,7 +30,8 @@ def parse(record: Record) -> Rig:
     cameras, extrinsics = {}, {}
     record.few(len(record["CameraCalibrations"]))
     for entry in record["CameraCalibrations"]:
-        if (name := entry["Label"].text()) in cameras:
+        name = entry["Label"].text()
+        if name in cameras:
             entry["Label"].fail(f"must be unique; got {name!r:.60} twice")
         projection = entry["Projection"]
         key, focals, count = _MODELS[one_of(projection["Name"], _MODELS)]
@@ -45,7 +46,8 @@ def parse(record: Record) -> Rig:
         cameras[name] = projection.camera(key, values[:4], distortion, size)
         if "T_Device_Camera" in entry:
             place = entry["T_Device_Camera"]
-            if len(quaternion := place["UnitQuaternion"]) != 2:
+            quaternion = place["UnitQuaternion"]
+            if len(quaternion) != 2:
                 quaternion.fail(f"must be [w, [x, y, z]]; got {quaternion.value!r:.60}")
             w, xyz = quaternion
             numbers = [w.number(), *xyz.numbers(3), *place["Translation"].numbers(3)]

@@ -44,7 +44,8 @@ def parse(record: Record) -> Rig:
     extrinsics: dict[str, tuple[Tensor, Tensor]] = {}
     images: dict[str, str] = {}
     for name in record["extrinsics"].keys() if "extrinsics" in record else ():
-        if "camera" in (entry := record["extrinsics"][name]):
+        entry = record["extrinsics"][name]
+        if "camera" in entry:
             images[name] = entry["camera"].text()
         if images.get(name, name) not in cameras:
             entry.fail(f"camera must be in the file; got {images.get(name, name)!r:.60}")
@@ -107,7 +108,8 @@ def _camera(record: Record) -> Camera:
 
 def _same_batch(record: Record, *tensors: Tensor) -> None:
     """Refuse batch dims that would grow when they are broadcast: a small file must not take much memory."""
-    if len(shapes := {tuple(t.shape[:-1]) for t in tensors} - {()}) > 1:
+    shapes = {tuple(t.shape[:-1]) for t in tensors} - {()}
+    if len(shapes) > 1:
         record.fail(f"batch dims must be equal; got {', '.join(map(str, sorted(shapes)))}")
 
 

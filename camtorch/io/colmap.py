@@ -254,7 +254,8 @@ def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
     if not all(0 <= i <= _LARGEST_ID for i in ids):
         ids = list(range(1, len(ids) + 1))
     identities = dict(zip(rig.cameras, ids, strict=True))
-    if not (path := lossy.path).endswith(NAMES.suffixes):  # a folder that does not exist yet
+    path = lossy.path
+    if not path.endswith(NAMES.suffixes):  # a folder that does not exist yet
         path = os.path.join(path, "cameras.txt")
     binary = path.endswith(".bin")
     blocks = [struct.pack("<Q", len(ids)) if binary else _CAMERAS.format(len(ids)).encode()]
@@ -276,7 +277,8 @@ def render(rig: Rig, lossy: Lossy) -> dict[str, bytes]:
             lossy.fail("extrinsics", f"must be in images{suffix} next to cameras{suffix}; got another name. {way}")
         contents[beside] = _images_content(lossy, rig, identities, beside, binary)
         # COLMAP opens a folder only if it has a file of points
-        if not os.path.exists(points := os.path.join(os.path.dirname(path), f"points3D{suffix}")):
+        points = os.path.join(os.path.dirname(path), f"points3D{suffix}")
+        if not os.path.exists(points):
             contents[points] = struct.pack("<Q", 0) if binary else b"# Number of points: 0\n"
     elif beside is not None and os.path.exists(beside):
         lossy.fail("extrinsics", f"must be given, as {beside} has poses of images; got none")

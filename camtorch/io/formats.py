@@ -235,7 +235,8 @@ def rendered(rig: Rig | Camera, path: str | os.PathLike[str], format: str | None
             raise TypeError(f"{path}: {name} must be of a model with a key; got {type(camera).__name__}")
     format = _known(format, WRITTEN, "written") or _format_of(rig, path)
     if os.path.isdir(path):
-        if not (inside := [os.path.join(path, name) for name in WRITTEN[format].in_folder]):
+        inside = [os.path.join(path, name) for name in WRITTEN[format].in_folder]
+        if not inside:
             raise ValueError(f"{path}: path must be a file for {format}; got a folder. Add a name")
         path = next(filter(os.path.exists, inside), inside[-1])
     try:

@@ -32,9 +32,11 @@ def matches(path: str, content: bytes) -> bool:
 
 def read(path: str, content: bytes) -> Rig:
     """Return the camera of a calibration; or the calibrated sensors by their labels, and the poses of their images."""
-    if (root := parse_xml(path, decoded(path, content))).tag == "calibration":
+    root = parse_xml(path, decoded(path, content))
+    if root.tag == "calibration":
         return Rig({"camera": _camera(Record(path, _values(root), "calibration"))})
-    if len(chunks := root.findall("chunk")) != 1:
+    chunks = root.findall("chunk")
+    if len(chunks) != 1:
         Record(path, None, "document").fail(f"must have one chunk; got {len(chunks)}. Export each to a file of its own")
     sensors = [sensor for sensor in chunks[0].iterfind("sensors/sensor") if sensor.find("calibration") is not None]
     Record(path, None, "sensors").few(len(sensors))

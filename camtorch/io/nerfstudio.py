@@ -76,7 +76,8 @@ def _camera(record: Record, frame: Record | None = None) -> Camera:
     if "camera_model" in merged:
         model = one_of(merged["camera_model"], _MODELS)
     size = (merged["h"].side(), merged["w"].side()) if "h" in merged and "w" in merged else None
-    if (key := _MODELS[model]) == "equirectangular":
+    key = _MODELS[model]
+    if key == "equirectangular":
         size = merged["h"].side(), merged["w"].side()
         return merged.camera(key, panorama(size), [], size)
     focals = [focal for focal in (_focal(merged, "x", "w"), _focal(merged, "y", "h")) if focal is not None]
@@ -149,7 +150,8 @@ def _entries(lossy: Lossy, name: str, camera: Camera) -> dict[str, Any]:
     key, (fx, fy, cx, cy), distortion = lossy.model(name, camera, set(_MODELS.values()))
     entries: dict[str, Any] = {"camera_model": next(model for model, k in _MODELS.items() if k == key)}
     if key == "equirectangular":
-        if [fx, fy, cx, cy] != panorama(size := lossy.size(name, camera)):
+        size = lossy.size(name, camera)
+        if [fx, fy, cx, cy] != panorama(size):
             lossy.fail(name, "must be a whole sphere for Nerfstudio; got a part of a panorama")
         return {**entries, "w": size[1], "h": size[0]}
     entries |= {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5}

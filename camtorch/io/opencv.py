@@ -143,16 +143,19 @@ class _File:
 
     def stated(self) -> tuple[tuple[str, ...], str | None]:
         """Return the models that the fisheye flag allows, and its key; no models and None if there is no flag."""
-        if (key := self.find(_FISHEYE)) is None:
+        key = self.find(_FISHEYE)
+        if key is None:
             return (), None
-        if not isinstance(flag := self.record[key].value, (str, float, bool)):
+        flag = self.record[key].value
+        if not isinstance(flag, (str, float, bool)):
             self.fail(key, f"must be true or false; got {flag!r:.60}")
         no = str(flag).strip().lower() in ("", "0", "0.", "0.0", "false", "no", "off", "n")
         return ("brown_conrady", "pinhole") if no else ("kannala_brandt",), key
 
     def model(self, distortion: list[float], stated: tuple[str, ...]) -> str:
         """Return the model if the caller does not name one."""
-        if (other := self.find(_OTHER_LENS)) is not None:
+        other = self.find(_OTHER_LENS)
+        if other is not None:
             name = "Write model='kannala_brandt' or --from-model kannala_brandt"
             self.fail(other, f"must be absent, or the model be named; got a file that may mean another model. {name}")
         if "kannala_brandt" in stated:

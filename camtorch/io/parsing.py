@@ -63,7 +63,8 @@ def read_bytes(path: Path, largest: int = LARGEST_FILE) -> bytes:
     """Return the content of an ordinary file that is neither empty nor suspiciously large."""
     check_ordinary(path)
     with open(path, "rb") as file:
-        if (size := os.fstat(file.fileno()).st_size) > largest:
+        size = os.fstat(file.fileno()).st_size
+        if size > largest:
             raise CameraFileError(path, "size", f"must be at most {largest >> 20} MiB; got {size} bytes")
         content = file.read(size)
     if not content:
@@ -107,7 +108,8 @@ def parse_json(path: Path, text: str) -> Any:
         raise CameraFileError(path, "content", "must have fewer values; got too many")
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(keys := dict(pairs)) < len(pairs):
+        keys = dict(pairs)
+        if len(keys) < len(pairs):
             raise ValueError(f"keys must be unique; got {repeated(key for key, _ in pairs)!r:.60} twice")
         return keys
 
@@ -185,7 +187,8 @@ def _from_storage(path: Path, text: str) -> Any:
 
     def value_of(element: ElementTree.Element) -> Any:
         if element is root or any(child.tag != "_" for child in element):
-            if (twice := repeated(child.tag for child in element)) is not None:
+            twice = repeated(child.tag for child in element)
+            if twice is not None:
                 raise CameraFileError(path, f"{element.tag:.60}", f"keys must be unique; got {twice!r:.60} twice")
             return {child.tag: value_of(child) for child in element}
         words = [quoted or word for quoted, word in _WORD.findall(element.text or "")]

@@ -86,7 +86,8 @@ def as_jpeg(image: Any, size: tuple[int, int], name: str, owner: str, side: int,
         elif not isinstance(image, Image.Image):
             if isinstance(image, Tensor):
                 image = (image if image.ndim == 2 else image.movedim(0, -1)).numpy(force=True)
-            if (values := np.asarray(image)).dtype.kind == "f":
+            values = np.asarray(image)
+            if values.dtype.kind == "f":
                 values = (255 * values).clip(0, 255).astype(np.uint8)
             image = Image.fromarray(values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values)
         height, width = _stored_size(image)

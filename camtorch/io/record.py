@@ -83,7 +83,8 @@ class Record:
         return key in self.value
 
     def __getitem__(self, key: str) -> Record:
-        if (found := self.get(key)) is None:
+        found = self.get(key)
+        if found is None:
             there = ", ".join(f"{name!r:.30}" for name in islice(self.value, _SHOWN)) or "none"
             more = ", ..." if len(self.value) > _SHOWN else ""
             Record(self.path, None, self.place_of(key)).fail(f"must be given; got keys {there}{more}")
@@ -152,7 +153,8 @@ class Record:
             name = "sizes" if "sizes" in self else "rows and cols"  # "sizes" for any number of dimensions
             parts = [self[key] for key in name.split(" and ")]
             sizes = [n for part in parts for n in (part.numbers() if isinstance(part.value, list) else [part.number()])]
-            if len(data := self["data"]) != math.prod(sizes):
+            data = self["data"]
+            if len(data) != math.prod(sizes):
                 data.fail(f"must have {' x '.join(f'{n:g}' for n in sizes)} numbers, by {name}; got {len(data)}")
             return data.numbers()
         if not isinstance(self.value, list):
@@ -186,7 +188,8 @@ class Record:
 
     def intrinsics(self) -> list[float]:
         """Return the focal lengths and principal point of the camera matrix at this place, read by `flat`."""
-        if len(matrix := self.flat()) != 9:
+        matrix = self.flat()
+        if len(matrix) != 9:
             self.fail(f"a camera matrix must have 3 x 3 numbers; got {len(matrix)}")
         fx, skew, cx, below, fy, cy, *bottom = matrix
         if skew:
