@@ -90,34 +90,37 @@ def select(
     def calibrated(rows: NDArray[Any], model: str | Camera, **options: Any) -> Calibration:
         return calibrate(model, points[rows], pixels[rows], image_size=layout.image_size, **options)
 
-    weights = np.isfinite(pixels[..., 0]).sum(1)  # the corners of each view
-    tried, trials = list(candidates), []
-    for number, (model, count) in enumerate(tried, 1):
+    corners = np.isfinite(pixels[..., 0]).sum(1)  # of each view
+    numbers = np.arange(len(corners))
+
+    def tried(model: str, count: int) -> Trial:
         names = [name for name in fixed if name in Model(MODELS[model], count).names]
         options = {"fixed": names, "loss": loss, "loss_scale": loss_scale}
-        numbers, errors = np.arange(len(weights)), np.full(len(weights), np.nan)
-        trial = Trial(model, count, math.nan, math.nan, errors)
+        errors = np.full(len(numbers), np.nan)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # the numbers of a trial show what is wrong
-                whole = calibrated(numbers, model, count=count, **options)
-                if not whole.converged:
-                    raise ValueError("no optimum was found")
-                folds = min(_FOLDS, len(numbers))
-                for fold in range(folds):
-                    out = numbers % folds == fold
-                    part = calibrated(np.flatnonzero(~out), whole.camera, **options)
-                    posed = calibrated(np.flatnonzero(out), part.camera, fixed="all", loss=None)
-                    errors[out] = np.nanmean(np.square(np.asarray(posed.residuals)).sum(-1), axis=1)
-            held_out = math.sqrt(float((weights * errors).sum() / weights.sum()))
+            whole = calibrated(numbers, model, count=count, **options)
+            if not whole.converged:
+                raise ValueError("no optimum was found")
+            folds = min(_FOLDS, len(numbers))
+            for fold in range(folds):
+                out = numbers % folds == fold
+                part = calibrated(np.flatnonzero(~out), whole.camera, **options)
+                posed = calibrated(np.flatnonzero(out), part.camera, fixed="all", loss=None)
+                errors[out] = np.nanmean(np.square(np.asarray(posed.residuals)).sum(-1), axis=1)
+            held_out = math.sqrt(float((corners * errors).sum() / corners.sum()))
             if not math.isfinite(held_out):
                 raise ValueError("held-out views have corners without a pixel")
-            trial.rms, trial.held_out = whole.rms, held_out
         except ValueError as error:
-            trial.reason = str(error)
-        trials.append(trial)
+            return Trial(model, count, math.nan, math.nan, errors, str(error))
+        return Trial(model, count, whole.rms, held_out, errors)
+
+    models, trials = list(candidates), []
+    for number, (model, count) in enumerate(models, 1):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # the numbers of a trial show what is wrong
+            trials.append(tried(model, count))
         if progress is not None:
-            progress(number / len(tried))
+            progress(number / len(models))
     fitted = [trial for trial in trials if not trial.reason]
     if not fitted:
         raise ValueError(f"select: one of candidates must fit; got none. {trials[0].model}: {trials[0].reason}")

@@ -1,6 +1,5 @@
 """The result of a calibration, with its use and the limits of its data in words, and advice."""
 
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +19,11 @@ from camtorch.rays.lattices import angles_from_axis, image_lattice
 _FINE, _ROUGH = 0.5, 3.0  # px, standard deviations of projections for measuring, and for viewing
 _CELLS, _PATTERN = 32, 8  # cells along the longer side: of the map of uncertainty, and of residuals
 _FEW_VIEWS = 6
-_NINTHS = ("top", "", "bottom"), ("left", "", "right")
+_NINTHS = (  # of an image, by rows
+    *("top left", "top", "top right"),
+    *("left", "", "right"),
+    *("bottom left", "bottom", "bottom right"),
+)
 _ALIKE = math.radians(30)  # the largest angle between two boards
 _BEYOND = math.radians(3)
 _FISHEYE, _RIM = math.radians(60), math.radians(8)  # a fisheye's image may end this far beyond its corners
@@ -179,13 +182,13 @@ class _Survey:
         # a fisheye's corners reach nearly to the circle at which its image ends
         ends_in_the_dark = self.reach > _FISHEYE and self.image_reach > self.reach + _RIM
         self.without_rays = 0.0 if ends_in_the_dark else float((~self.has_ray).double().mean())
-        # the largest uncertainty of each ninth of the image, by rows; the names of weak ones, the worst first
-        names = [f"the {' '.join(pair).strip()}" for pair in itertools.product(*_NINTHS)]
+        # the largest uncertainty of each ninth of the image, by rows
         values = self.uncertainty.nan_to_num(0.0 if ends_in_the_dark else torch.inf)
         most = [float(part.amax()) for band in values.tensor_split(3) for part in band.tensor_split(3, -1)]
         self.middle = most[4]
-        weak = [pair for pair in zip(most, names, strict=True) if pair[0] > max(_FINE, 3 * self.middle)]
-        self.weak = " and ".join(", ".join(name for _, name in sorted(weak, reverse=True)[:3]).rsplit(", ", 1))
+        weak = [(one, name) for one, name in zip(most, _NINTHS, strict=True) if one > max(_FINE, 3 * self.middle)]
+        weakest = ", ".join(f"the {name}" for _, name in sorted(weak, reverse=True)[:3])
+        self.weak = " and ".join(weakest.rsplit(", ", 1))
 
     def good_within(self, limit: float, furthest: float = math.inf) -> tuple[float, float]:
         """Return the angle from the axis up to which projections are certain to `limit` px, and the image's part."""
@@ -206,7 +209,6 @@ class _Survey:
 
 def _of_residuals(calibration: Calibration) -> Iterator[str]:
     """Generate warnings about residuals: of all corners, of single ones, of views, and of parts of the image."""
-    seen, inliers = calibration.observations.seen, calibration.point_inliers
     if calibration.failure:
         yield (
             f"Do not use this camera: {calibration.failure}. Check the board's size, the image size and the model, try "
@@ -217,6 +219,21 @@ def _of_residuals(calibration: Calibration) -> Iterator[str]:
             f"Residuals are {_px(calibration.sigma)} per coordinate, far more than the errors of corners: the board "
             "may be bent or not as described, images smeared, or the model not that of the lens"
         )
+    yield from _of_outliers(calibration)
+    # px: corners may be float32
+    rounding = torch.finfo(torch.float32).eps * float(calibration.observations.pixels.abs().amax())
+    yield from _of_worse_views(calibration, rounding)
+    share = _pattern_share(calibration) if calibration.rms > rounding else 0.0
+    if share > _PATTERN_SHARE:
+        yield (
+            f"The residuals have a pattern over the image, of {_px(share * calibration.rms)}: the model is not that of "
+            "the lens, or the board is bent. Try brown_conrady with count=8, kannala_brandt or fisheye624, or bend=True"
+        )
+
+
+def _of_outliers(calibration: Calibration) -> Iterator[str]:
+    """Generate the warning about corners that are far more wrong than others, or more of them than chance makes."""
+    seen, inliers = calibration.observations.seen, calibration.point_inliers
     bad, squares = seen & ~inliers, calibration.point_residuals.square().sum(-1)
     per_view, count, total = bad.sum(-1), int(bad.sum()), int(seen.sum())
     usual = float(squares[inliers].mean()) / 2 if bool(inliers.any()) else 0.0
@@ -228,8 +245,11 @@ def _of_residuals(calibration: Calibration) -> Iterator[str]:
         }.get(calibration.loss, "")
         most = f"{int(per_view.max())} of them in {named([calibration.views[int(per_view.argmax())]])}"
         yield f"{count} of {total} corners are outliers, {most}{robust}. Look at the views"
-    # px: corners may be float32
-    rounding = torch.finfo(torch.float32).eps * float(calibration.observations.pixels.abs().amax())
+
+
+def _of_worse_views(calibration: Calibration, rounding: float) -> Iterator[str]:
+    """Generate the warning about views with far greater residuals than others, and than the rounding of pixels."""
+    seen, squares = calibration.observations.seen, calibration.point_residuals.square().sum(-1)
     rms = ((squares * seen).sum(-1) / seen.sum(-1)).sqrt()  # NaN for views of a rig that this camera does not see
     middle = float(rms.nanmedian())
     worse = (rms > max(_WORSE_VIEW * middle, rounding)).nonzero()[:, 0].tolist()
@@ -237,12 +257,6 @@ def _of_residuals(calibration: Calibration) -> Iterator[str]:
         yield (
             f"The rms of {named([calibration.views[i] for i in worse])} is up to {_px(float(rms[worse].amax()))}, and "
             f"{_px(middle)} is usual. Look at the corners, or leave such views out: they widen all uncertainties"
-        )
-    share = _pattern_share(calibration) if calibration.rms > rounding else 0.0
-    if share > _PATTERN_SHARE:
-        yield (
-            f"The residuals have a pattern over the image, of {_px(share * calibration.rms)}: the model is not that of "
-            "the lens, or the board is bent. Try brown_conrady with count=8, kannala_brandt or fisheye624, or bend=True"
         )
 
 
