@@ -246,9 +246,8 @@ class Bundle:
         self.learnt = [(self._next_places(len(own)), own) for own in indices]
         self.mounted = [self._next_places(6 if free.mounts and c > 0 else 0) for c in range(len(observed))]
         self.bent = self._next_places(2 if free.bend else 0)
-        self.is_bent = free.bend or bool((state.bend != 0).any())
         # native code knows one camera that sees flat boards at unknown poses
-        is_plain = len(observed) == 1 and free.boards == "poses" and not self.is_bent
+        is_plain = len(observed) == 1 and free.boards == "poses" and not free.bend
         self.is_compiled = is_plain and native_forms(self.cameras, self.observed[0].pixels) is not None
         self.width = 6 if free.boards == "poses" else 3  # of the unknowns of a view
         views = torch.stack([(s.weights > 0).any(-1).any(0) for s in self.observed]).any(0).sum()
@@ -280,7 +279,7 @@ class Bundle:
 
     def points(self, c: int, state: State, observed: CameraObservations) -> tuple[Tensor, Tensor, Tensor]:
         """Return points (B, V, N, 3) of the turned board, of the first camera's frame, and of this camera's frame."""
-        points = bend_points(observed.points, state.bend)[0] if self.is_bent else observed.points
+        points = bend_points(observed.points, state.bend)[0] if self.free.bend else observed.points
         turned = points @ state.boards.rotations.mT
         first = turned + state.boards.translations[:, :, None]
         if c == 0:
@@ -400,7 +399,7 @@ class Bundle:
         if self.mounted[c]:
             turned = first @ state.mounts.rotations[:, c, None].mT
             columns += [torch.linalg.cross(turned[..., None, :].expand_as(by_point), by_point, dim=-1), by_point]
-        if self.bent:
+        if self.free.bend:
             along = by_first @ state.boards.rotations[:, :, None, :, 2:]
             columns.append(along * bend_points(observed.points, state.bend)[1][..., None, :])
         columns.append(errors.residuals[..., None])

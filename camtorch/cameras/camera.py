@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import typing
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, cast
@@ -38,11 +37,13 @@ from camtorch.values.arguments import Numbers, broadcast_shapes, hinting, warn
 from camtorch.values.module import GeometryModule, typed_as
 
 if TYPE_CHECKING:
-    from typing_extensions import TypeVar  # with a default; checkers of types bring it
+    from typing_extensions import TypeVar  # which checkers of types bring
 
     Model = TypeVar("Model", bound="Camera", default="Camera")
 else:
-    Model = typing.TypeVar("Model", bound="Camera")  # Python 3.11 has no defaults
+    from typing import TypeVar
+
+    Model = TypeVar("Model", bound="Camera")  # of which only Python 3.13 knows a default
 
 
 MODELS: Catalogue[type[Camera]] = Catalogue()
@@ -571,7 +572,7 @@ class Camera(Freezable, Editable):
     def __dir__(self) -> list[str]:
         """Return the names that users call, without those that a model states or that modules are made of."""
         inside = {*vars(ModelSpec), *vars(CameraLike), *dir(GeometryModule)}
-        inside |= {"each", "form", "memo_names", "size_for", "tensor_names", "tensors"}
+        inside |= {"each", "form", "learn_like", "memo_names", "size_for", "tensor_names", "tensors"}
         inside -= {"distortion_names", "is_mixed", *dir(nn.Module)}
         names: list[str] = super().__dir__()  # type: ignore[no-untyped-call]
         return [n for n in names if n not in inside and (n[:1] != "_" or n[:2] == "__")]

@@ -28,18 +28,13 @@ def quarter_turns(image_size: tuple[int, int]) -> tuple[tuple[tuple[int, int, in
     )
 
 
-def edited(
-    camera: CameraT,
-    matrix: Tensor | Sequence[Sequence[float]],
-    image_size: tuple[int, int] | None,
-    learns: bool = False,
-) -> CameraT:
+def edited(camera: CameraT, matrix: Tensor | Sequence[Sequence[float]], image_size: tuple[int, int] | None) -> CameraT:
     """Return the camera of an image whose pixels move by a `matrix` each, (*B, 2, 3): quarter turns, flips, scales.
 
-    Without a graph it is fixed; with `learns` it learns if the camera does.
+    Without a graph it is fixed.
     """
     if camera.is_mixed:
-        return cast("CameraT", cast("Any", camera).by_groups(lambda group: edited(group, matrix, image_size, learns)))
+        return cast("CameraT", cast("Any", camera).by_groups(lambda group: edited(group, matrix, image_size)))
     own, given = camera.intrinsics, [matrix] if isinstance(matrix, Tensor) else []
     xp: Any = np if are_numbers(own, camera.distortion, *given) else torch
     rows: Any = matrix
@@ -55,7 +50,7 @@ def edited(
         turns = np.any(turned) if xp is np else not known_true(matrix[..., 0, 1] == 0)
     distortion = _edit_distortion(camera, a - b, c + d, turned if turns else None)
     intrinsics = _stack_numbers((*focal, *centre), own, xp)
-    return remade(camera, learns, intrinsics=intrinsics, distortion=distortion, image_size=image_size)
+    return remade(camera, intrinsics=intrinsics, distortion=distortion, image_size=image_size)
 
 
 def _unstack_numbers(intrinsics: Tensor, xp: Any) -> Iterable[Any]:
@@ -119,6 +114,12 @@ class Editable(CameraLike):
     original's, where gradients go. The edited camera of a frozen one, or under `no_grad`, is a copy.
     """
 
+    def _edited(self, matrix: Sequence[Sequence[float]], image_size: tuple[int, int]) -> Self:
+        """Return the camera of an image edited by a matrix, see `edited`; its Parameters learn if this one's do."""
+        if self.is_mixed:
+            return cast("Self", cast("Any", self).by_groups(lambda group: group._edited(matrix, image_size)))
+        return edited(self, matrix, image_size).learn_like(self)
+
     def crop(self, top: int, left: int, height: int, width: int) -> Self:
         """Return the camera of the part of the image whose top-left pixel is (left, top); it may reach outside.
 
@@ -133,7 +134,7 @@ class Editable(CameraLike):
                 f"{type(self).__name__}.crop: (top, left, height, width) must hold a pixel of the "
                 f"image (height, width) = {size}; got {(top, left, height, width)}"
             )
-        return edited(self, ((1, 0, -left), (0, 1, -top)), new_size, learns=True)
+        return self._edited(((1, 0, -left), (0, 1, -top)), new_size)
 
     def pad(self, left: int, right: int, top: int, bottom: int) -> Self:
         """Return the camera of the image with that many more pixels on each side."""
@@ -141,7 +142,7 @@ class Editable(CameraLike):
         sides = ((left, "left"), (right, "right"), (top, "top"), (bottom, "bottom"))
         left, right, top, bottom = (as_whole(value, name, "pad") for value, name in sides)
         new_size = as_known_size((height + top + bottom, width + left + right), type(self).__name__)
-        return edited(self, ((1, 0, left), (0, 1, top)), new_size, learns=True)
+        return self._edited(((1, 0, left), (0, 1, top)), new_size)
 
     @hinting("It takes camera.resize(height, width), two numbers")
     def resize(self, height: int, width: int) -> Self:
@@ -153,17 +154,17 @@ class Editable(CameraLike):
         new_size = as_known_size((height, width), f"{type(self).__name__}.resize")
         warn_of_exchange((old_height, old_width), (height, width), f"{type(self).__name__}.resize")
         across, down = width / old_width, height / old_height
-        return edited(self, ((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), new_size, learns=True)
+        return self._edited(((across, 0, (across - 1) / 2), (0, down, (down - 1) / 2)), new_size)
 
     def hflip(self) -> Self:
         """Return the camera that sees the scene mirrored left to right: its image is this one's, flipped."""
         height, width = self.size_for("hflip")
-        return edited(self, ((-1, 0, width - 1), (0, 1, 0)), (height, width), learns=True)
+        return self._edited(((-1, 0, width - 1), (0, 1, 0)), (height, width))
 
     def vflip(self) -> Self:
         """Return the camera that sees the scene mirrored top to bottom: its image is this one's, flipped."""
         height, width = self.size_for("vflip")
-        return edited(self, ((1, 0, 0), (0, -1, height - 1)), (height, width), learns=True)
+        return self._edited(((1, 0, 0), (0, -1, height - 1)), (height, width))
 
     def rot90(self, k: int = 1) -> Self:
         """Return the camera whose image is this one's, turned counterclockwise k times as by torch.rot90.
@@ -174,4 +175,4 @@ class Editable(CameraLike):
             ValueError: If a model that is not the same on its side, like a cylinder's, is turned by a quarter.
         """
         size, turns = self.size_for("rot90"), as_whole(k, "k", "rot90") % 4
-        return edited(self, quarter_turns(size)[turns], size[::-1] if turns % 2 else size, learns=True)
+        return self._edited(quarter_turns(size)[turns], size[::-1] if turns % 2 else size)

@@ -153,7 +153,7 @@ class Extrinsics(BatchedModule):
         """Return the inverse pose: world from camera."""
         # learnt rotation vectors may have any length
         rotation = -self.rotation.expand(*self.batch_shape, 3)
-        return remade(self, True, rotation=rotation, translation=self.position)
+        return remade(self, rotation=rotation, translation=self.position).learn_like(self)
 
     def compose(self, other: Extrinsics) -> Extrinsics:
         """Return the pose that applies `other` first, then this one: `a.compose(b)(p) == a(b(p))`."""

@@ -272,6 +272,14 @@ class BatchedModule(GeometryModule):
         """Return a new module like this one, with `change` applied to each of its tensors (*B, n)."""
         return remade(self, **{name: change(getattr(self, name)) for name in self.tensor_names})
 
+    def learn_like(self, source: Self) -> Self:
+        """Let the Parameters learn that learn in the module of the same kind that this one was made from."""
+        for name in self.tensor_names:
+            tensor = getattr(self, name)
+            if isinstance(tensor, nn.Parameter):
+                tensor.requires_grad_(getattr(source, name).requires_grad)
+        return self
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers, strings and lists, as camtorch's JSON has them.
 
@@ -296,10 +304,10 @@ def model_of(module: Made) -> type[Made]:
     return type_before_parametrizations(module) if "parametrizations" in module._modules else type(module)
 
 
-def remade(module: Made, learns: bool = False, /, **changes: Any) -> Made:
+def remade(module: Made, /, **changes: Any) -> Made:
     """Return the module with other attributes and tensors, neither checked nor copied.
 
-    New tensors without a graph are `fixed`; with `learns` they are Parameters that learn if those of the module do.
+    New tensors without a graph are `fixed`.
     """
     model: Any = model_of(module)
     tensors = {name: changes.pop(name) if name in changes else getattr(module, name) for name in module.tensor_names}
@@ -325,10 +333,6 @@ def remade(module: Made, learns: bool = False, /, **changes: Any) -> Made:
                 parameters[name] = untraced[name] = its
             else:
                 made.put(name, _widen(its))
-    for name in module.tensor_names if learns else ():
-        its = getattr(made, name)
-        if isinstance(its, nn.Parameter):
-            its.requires_grad_(getattr(module, name).requires_grad)
     return made
 
 
