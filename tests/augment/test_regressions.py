@@ -1,4 +1,4 @@
-"""Corners of the augmentations where they once were wrong."""
+"""What augmentations once did wrong, where several fields, options or cameras meet."""
 
 import math
 

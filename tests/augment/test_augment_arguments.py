@@ -1,4 +1,4 @@
-"""What cannot be augmented says so at the door: which field, what it was, what it should be."""
+"""What is no sample, option or camera of augmentations is refused: which field, what it was, what it should be."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Bad input is refused at the door: the message names the argument and shows what was passed."""
+"""Bad input is refused where it is passed: the message names the argument and shows what was passed."""
 
 import math
 import re
