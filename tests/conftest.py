@@ -26,9 +26,11 @@ def pytest_collection(session):
         # forward-mode derivatives load it on first use, and it uses the deprecated torch.jit.script
         warnings.simplefilter("ignore")
         import torch._decomp.decompositions_for_jvp
-    if not torch.accelerator.is_available():  # torch's own keeps a traceback for each kind of device: a millisecond
+    # torch's own keeps a traceback for each kind of device, 0.9 ms of the 28 that a test takes
+    if not torch.accelerator.is_available():
         torch.manual_seed = torch.default_generator.manual_seed
-    os.fsync = lambda file: None  # a hundredth of a second for each file, of which none must outlive a loss of power
+    # 9 ms for each of 670 files, 6 s in all; none must outlive a loss of power, and test_saving.py has its own
+    os.fsync = lambda file: None
     # xdist has a process on every core already
     torch.set_num_threads(1)
     # the same examples on every machine and in every run; speed is not what these tests are about
