@@ -15,6 +15,7 @@ import torch
 from hypothesis import strategies as st
 
 import camtorch as ct
+from camtorch.native.library import native_available
 
 GOLDEN = {path.stem: json.loads(path.read_text()) for path in sorted((Path(__file__).parent / "golden").glob("*.json"))}
 _FILES = [path for path in sorted(Path(ct.__file__).parent.glob("models/*.py")) if not path.name.startswith("_")]
@@ -43,6 +44,7 @@ def slow_unless(quick, cases):
     return [pytest.param(*values, marks=marks) for values, marks in marked]
 
 
+needs_library = pytest.mark.skipif(not native_available(), reason="the library is not compiled here, or turned off")
 RARE_ARE_SLOW = slow_unless(DISTINCT.__contains__, KEYS)
 every_model = pytest.mark.parametrize("key", KEYS)
 # for what has nothing to do with the model, and might with the kinds of chart and lens

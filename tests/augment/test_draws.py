@@ -2,17 +2,16 @@
 
 import pytest
 import torch
-from cameras import DISTINCT, KEYS, slow_unless, spread
+from cameras import DISTINCT, KEYS, needs_library, slow_unless, spread
 
 import camtorch as ct
 from camtorch.augment.drawer import CameraDrawer
 from camtorch.augment.filling import enough, scaled
 from camtorch.evaluate.kept import Kept
-from camtorch.native.library import native_available
 from camtorch.projection import native_cameras
 
 A = ct.augment
-pytestmark = pytest.mark.skipif(not native_available(), reason="no compiled library")
+pytestmark = needs_library
 AUGMENTATIONS = {
     "mount": lambda: A.RandomMount(zoom=0.2, fov=(40, 60)),
     "lens": lambda: A.RandomLens(),

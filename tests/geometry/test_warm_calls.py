@@ -6,13 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from cameras import one
+from cameras import needs_library, one
 from torch.overrides import TorchFunctionMode
 
 import camtorch as ct
-from camtorch.native.library import native_available
 
-pytestmark = pytest.mark.skipif(not native_available(), reason="needs the compiled library")
+pytestmark = needs_library
 
 # files, functions
 MOST = {"project": (4, 16), "unproject": (5, 18)}

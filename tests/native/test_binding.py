@@ -9,16 +9,16 @@ import shutil
 
 import pytest
 import torch
+from cameras import needs_library
 from test_build import compiles
 
 import camtorch as ct
 from camtorch.native import build as building
 from camtorch.native import headers, sampler, self_test, structs
-from camtorch.native.library import library, native_available
+from camtorch.native.library import library
 from camtorch.projection import native_calls
 from camtorch.projection.evaluation import camera_rows
 
-has_library = pytest.mark.skipif(not native_available(), reason="no compiled library is here")
 HERE = building._HERE
 
 
@@ -28,7 +28,7 @@ def test_the_generated_file_is_what_the_headers_give():
     assert (HERE / "structs.py").read_text() == headers.structs_py(), "run `python -m camtorch.native.headers`"
 
 
-@has_library
+@needs_library
 def test_a_wrong_field_a_wrong_length_and_a_wrong_structure_are_errors():
     rows = structs.Rows()
     with pytest.raises(AttributeError):
@@ -47,7 +47,7 @@ def test_no_guard_of_a_call_goes_with_python_minus_o():
     ]
 
 
-@has_library
+@needs_library
 def test_rows_of_other_cameras_and_shapes_are_errors_before_a_call():
     camera = ct.Pinhole([[1.0, 1, 0, 0]] * 2, image_size=(2, 2))
     native = camera_rows(camera, *(t.detach() for t in camera.tensors)).native
@@ -57,7 +57,7 @@ def test_rows_of_other_cameras_and_shapes_are_errors_before_a_call():
         native_calls.project_vjp(native, torch.ones(2, 4, 3), torch.ones(2, 2, 5), True, False)
 
 
-@has_library
+@needs_library
 def test_each_call_has_a_known_answer():
     calls = headers.read().calls.items()
     assert sorted(self_test.ANSWERS) == sorted(name for name, (_, given) in calls if given not in ([], ["char*"]))

@@ -8,10 +8,10 @@ import threading
 
 import pytest
 import torch
+from cameras import needs_library
 
 import camtorch as ct
 from camtorch.native import memory
-from camtorch.native.library import native_available
 
 LAYOUTS = (torch.contiguous_format, torch.channels_last)
 SHAPE = (2, 3, 640, 480)  # 7 MB of float32
@@ -126,7 +126,7 @@ def test_a_child_has_memory_of_its_own():
     assert bool((tensor == 1).all())
 
 
-@pytest.mark.skipif(not native_available(), reason="the sampler is not compiled here, or turned off")
+@needs_library
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_results_of_warps_are_of_it(layout):
     source = ct.KannalaBrandt([700.0, 700, 640, 360], [0.02, -0.01, 0.004, -0.001], image_size=(720, 1280))

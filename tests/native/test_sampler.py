@@ -11,12 +11,12 @@ from itertools import product
 
 import pytest
 import torch
-from cameras import default_dtype_of_double
+from cameras import default_dtype_of_double, needs_library
 
 import camtorch as ct
 from camtorch.native import build as building
 from camtorch.native import sampler
-from camtorch.native.library import _find, library, native_available
+from camtorch.native.library import _find, library
 from camtorch.native.structs import OUTSIDE
 from camtorch.values.dtypes import widen
 from camtorch.warp import grid_sample, sampling
@@ -26,7 +26,7 @@ from camtorch.warp.options import MODES, PADDINGS, Sampler
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 INTEGERS = (torch.bool, torch.uint8, torch.int8, torch.uint16, torch.int16, torch.int32, torch.int64)
 
-pytestmark = pytest.mark.skipif(not native_available(), reason="the sampler is not compiled here, or turned off")
+pytestmark = needs_library
 
 
 @contextmanager

@@ -7,16 +7,14 @@ import numpy as np
 import PIL.Image
 import pytest
 import torch
-from cameras import fisheye
+from cameras import fisheye, needs_library
 from torch.profiler import ProfilerActivity, profile
 
 import camtorch as ct
 import camtorch.augment.numpy
-from camtorch.native.library import native_available
 
 SIZE = (50, 70)
 camera = partial(fisheye, size=SIZE, focal=0.7)
-needs_native = pytest.mark.skipif(not native_available(), reason="there is no compiled library")
 
 
 def colours(channels=3, dtype=np.uint8, size=SIZE):
@@ -105,7 +103,7 @@ def allocated(call, count):
 LARGE = (360, 480)
 
 
-@needs_native
+@needs_library
 @pytest.mark.slow  # for the profiler
 @pytest.mark.parametrize("read_only", [False, True])
 def test_nothing_as_large_as_an_image_is_made_but_the_result(read_only):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
-from cameras import RARE_ARE_SLOW, each_kind, make, one, real, turn
+from cameras import RARE_ARE_SLOW, each_kind, make, needs_library, one, real, turn
 
 import camtorch as ct
 from camtorch.native import sampler
@@ -73,7 +73,7 @@ def test_tolerances_hold_beyond_the_rim(key, padding):
     check_padded(camera, wide, None, padding)
 
 
-@pytest.mark.skipif(not native_available(), reason="there is no compiled library")
+@needs_library
 @pytest.mark.parametrize("key", RARE_ARE_SLOW)
 def test_torch_doubts_the_cells_that_compiled_code_doubts(key, monkeypatch):
     """Cell by cell, and so the positions: of cells that are settled, of limits, of the rim, of far outside."""
@@ -274,7 +274,7 @@ def test_second_derivatives_of_warps_that_learn_are_those_of_the_lattice():
         assert (r - s).norm() <= 1e-3 * s.norm()
 
 
-@pytest.mark.skipif(not native_available(), reason="no compiled library")
+@needs_library
 def test_gradients_of_positions_may_lie_in_any_order_in_memory():
     cells, by = torch.full((1, 3, 4), CELL_CUBIC, dtype=torch.int32), torch.rand(2, 1, 24, 32).movedim(0, -1)
     assert torch.equal(sampler.lay_vjp(by, cells, 0)[0], sampler.lay_vjp(by.contiguous(), cells, 0)[0])
