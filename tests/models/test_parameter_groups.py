@@ -15,6 +15,9 @@ LENSES = {"kannala_brandt": FISHEYE[:8], "fisheye62": FISHEYE[:12], "fisheye624"
 LENSES |= {"brown_conrady": [420.0, 421, 323, 237, -0.1, 0.02, 0.001, -5e-4, 0], "ucm": [350.0, 351, 323, 237, 0.4]}
 OPTIMIZERS = {name: getattr(torch.optim, name) for name in ("Adam", "AdamW", "RMSprop", "SGD")}
 OPTIMIZERS["momentum"] = lambda groups: torch.optim.SGD(groups, momentum=0.9)
+# each optimizer with the lens that most people have, and each lens with one that adapts its steps and one that does not
+CASES = [("kannala_brandt", name) for name in OPTIMIZERS]
+CASES += [(key, name) for key in LENSES if key != "kannala_brandt" for name in ("AdamW", "momentum")]
 QUICK = {("kannala_brandt", "AdamW"), ("brown_conrady", "momentum")}.__contains__
 
 
@@ -48,7 +51,7 @@ def test_groups_of_what_learns_of_several_cameras():
     assert groups[2]["lr"] == pytest.approx(0.01 / focal.fy.item())
 
 
-@pytest.mark.parametrize(("key", "name"), slow_unless(QUICK, [(key, name) for key in LENSES for name in OPTIMIZERS]))
+@pytest.mark.parametrize(("key", "name"), slow_unless(QUICK, CASES))
 @pytest.mark.filterwarnings("ignore:.* became unusable")  # SGD may do that
 def test_the_loss_is_good_only_if_the_camera_is(key, name):
     truth = ct.MODELS[key](LENSES[key][:4], LENSES[key][4:], image_size=(480, 640)).requires_grad_(False)
