@@ -22,12 +22,12 @@ from camtorch.augment.edits import (
     VerticalFlip,
 )
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.fields import from_pitch_yaw, to_pitch_yaw
 from camtorch.augment.landmarks import LANDMARKS, face_points
 from camtorch.augment.presets import PRESETS, Preset
 from camtorch.augment.random_camera import RandomCamera, RandomLens, RandomMount
 from camtorch.augment.ranges import Range
 from camtorch.augment.shutter import RandomShutter
+from camtorch.poses.gaze import from_pitch_yaw, to_pitch_yaw
 from camtorch.poses.rotations import mount_rotation
 from camtorch.values.arguments import LEFT
 from camtorch.warp.boxes import outlines

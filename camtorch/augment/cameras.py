@@ -28,10 +28,7 @@ class Unknown(Pinhole):
 
 
 def known_camera(given: Any, own: Any) -> Any:
-    """Return the camera given with a sample, else the augmentation's own; a `Guess` or None if neither is known.
-
-    `SampleTransform._batch` writes this out, to save each sample a call.
-    """
+    """Return the camera given with a sample, else the augmentation's own; a `Guess` or None if neither is known."""
     return own if given is None or (isinstance(given, Guess) and isinstance(own, Camera)) else given
 
 

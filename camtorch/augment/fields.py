@@ -3,22 +3,37 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from camtorch.augment.change import Change
 from camtorch.augment.matrices import SHAPE, SIDES, check_matrix, matrix_hint, moved_matrix
-from camtorch.evaluate.tensors import known_some, known_true
-from camtorch.poses.rotations import are_rotations, check_rotation, is_right, rotation_matrix, rotation_vector
-from camtorch.values.arguments import as_coordinates, check_angles, check_boxes, check_radians
+from camtorch.augment.wrong_fields import (
+    CORNERS,
+    boxes_hint,
+    check_corners,
+    check_pitch_yaw,
+    check_pose,
+    column_hint,
+    image_hint,
+    keypoints_hint,
+    landmarks_hint,
+    no_check,
+    no_hint,
+    pose_hint,
+    rays_hint,
+    sides_check,
+)
+from camtorch.poses.gaze import from_pitch_yaw, to_pitch_yaw
+from camtorch.poses.rotations import rotation_matrix, rotation_vector
+from camtorch.values.arguments import check_radians
 from camtorch.values.dtypes import widen
-from camtorch.warp.at_once import Label
 from camtorch.warp.options import Options, Sampler
+from camtorch.warp.together import Label
 
 Named = dict[str, tuple[str, Any]]
 """Maps a name to (kind, tensor or list of tensors)."""
@@ -33,14 +48,6 @@ KEEP = "keep"
 Move = Callable[[Change, Tensor, Mapping[str, float]], Any]
 
 
-def _no_hint(value: Tensor, name: str, batched: bool) -> str:
-    return ""
-
-
-def _no_check(value: Tensor, name: str, owner: str) -> None:
-    pass
-
-
 @dataclass(kw_only=True)
 class Field:
     """A kind of field: how its values are recognised, checked and moved."""
@@ -50,14 +57,14 @@ class Field:
     ends: Sequence[tuple[int, ...]] = ()  # what its last dims may be; empty: anything
     shape: str  # in words, of a batch
     move: Move  # (change, batch, options) -> batch, or (batch, valid)
-    by_c: Label | Literal["never"] | Callable[[Options, float], Sampler] | None = None
-    """How the call of C for whole samples moves it, as `move` would: (options, mask_fill) -> sampler for images. None:
-    that call leaves it to `move`; "never": it needs each pixel's position, and the call is made for no such sample."""
+    together: Label | Callable[[Options, float], Sampler] | None = None
+    """How one call for several fields moves it, as `move` would: (options, mask_fill) -> sampler for images. None: that
+    call leaves it to `move`. Beside such an image C moves nothing: both would compute the position of each pixel."""
     is_image: bool = False  # whether its last dims are those of the camera's image, and whole numbers stay whole
     tells_batches: bool = False  # whether its number of dims distinguishes a batch from a sample
     in_pixels: bool = False  # whether it is warned of numbers that hardly are pixels of the image
-    hint: Callable[[Tensor, str, bool], str] = _no_hint  # (value, name, batched) -> what to do about a wrong shape
-    check: Callable[[Tensor, str, str], None] = _no_check  # (value, name, owner); raises if values are of no such kind
+    hint: Callable[[Tensor, str, bool], str] = no_hint  # (value, name, batched) -> what to do about a wrong shape
+    check: Callable[[Tensor, str, str], None] = no_check  # (value, name, owner); raises if values are of no such kind
 
     def __post_init__(self) -> None:
         self.most_dims = max(self.dims, self.most_dims)
@@ -123,25 +130,14 @@ def as_corners(kind: str, boxes: Tensor) -> Tensor:
     return torch.cat((low, low + size), -1)
 
 
-def _sided_boxes(kind: str, form: str) -> Field:
-    """Return the field of boxes by a point, width and height."""
+def _sided_boxes(kind: str, words: str) -> Field:
+    """Return the field of boxes by a point, width and height; words: what their numbers are."""
 
     def write(corners: Tensor) -> Tensor:
         low, high = corners.split(2, -1)
         return torch.cat((low + _ANCHORS[kind] * (high - low), high - low), -1)
 
-    def check_sides(value: Tensor, name: str, owner: str) -> None:
-        _check_form(kind, value, name, owner)
-        if value.requires_grad:
-            return
-        negative = (value[..., 2:] < 0).any(-1)
-        if known_true(negative.any()):
-            raise ValueError(
-                f"{owner}: {name} must be {shape}, with sides of 0 or more; got {value[negative][0].tolist()}. Boxes "
-                "x1, y1, x2, y2 are of the kind 'boxes'"
-            )
-
-    shape = f"(B, M, 4) pixels {form}"
+    shape = f"(B, M, 4) pixels {words}"
     return Field(
         dims=2,
         ends=[(4,)],
@@ -149,114 +145,9 @@ def _sided_boxes(kind: str, form: str) -> Field:
         move=_by(Change.boxes, functools.partial(as_corners, kind), write),
         tells_batches=True,
         in_pixels=True,
-        hint=_boxes_hint,
-        check=check_sides,
+        hint=boxes_hint,
+        check=sides_check(kind.removeprefix("boxes_").upper(), shape),
     )
-
-
-def _image_hint(value: Tensor, name: str, batched: bool) -> str:
-    if value.ndim == 5:
-        return f"The frames of clips go in as a batch, by {name}.flatten(0, 1)"
-    return f"A grey image goes in as {name}[None]" if value.ndim == 2 else ""
-
-
-def _rows_hint(value: Tensor, name: str, batched: bool) -> str:
-    """Return the hint for pixels or boxes without the dim of their number."""
-    if value.ndim - batched != 1:
-        return ""
-    shared = f", those that all samples share as {name}.expand(B, -1, -1)" if batched else ""
-    return f"A single one for each sample goes in as {name}[..., None, :]{shared}"
-
-
-def _keypoints_hint(value: Tensor, name: str, batched: bool) -> str:
-    if value.ndim and value.shape[-1] == 3:
-        return f"Pass visibility, [..., 2], as {name}_valid=..., a flag for each"
-    return _rows_hint(value, name, batched) if value.shape[-1:] == (2,) else ""
-
-
-def _boxes_hint(value: Tensor, name: str, batched: bool) -> str:
-    return _rows_hint(value, name, batched) if value.shape[-1:] == (4,) else ""
-
-
-def _column_hint(value: Tensor, name: str, batched: bool) -> str:
-    return f"OpenCV's column goes in as {name}[..., 0]" if value.shape[-2:] == (3, 1) else ""
-
-
-def _landmarks_hint(value: Tensor, name: str, batched: bool) -> str:
-    return _column_hint(value, name, batched) or (_rows_hint(value, name, batched) if value.shape[-1] in (2, 3) else "")
-
-
-def _rays_hint(value: Tensor, name: str, batched: bool) -> str:
-    if value.ndim and value.shape[-1] == 2:
-        return f"Pitch and yaw in radians go in as pitch_yaw, or with fields={{{name!r}: 'pitch_yaw'}}"
-    return _column_hint(value, name, batched)
-
-
-def _pose_hint(value: Tensor, name: str, batched: bool) -> str:
-    if value.shape[-1:] != (3,):
-        return ""
-    return (
-        "Rotations R (..., 3, 3) go in as torch.nn.functional.pad(R, (0, 1)), with zeros for the place; "
-        "R = ct.head_rotation(angles), of pitch, yaw and roll in radians. OpenCV's go in as rvec=..., tvec=..."
-    )
-
-
-def _check_form(kind: str, value: Tensor, name: str, owner: str) -> None:
-    form = getattr(getattr(value, "format", None), "value", None)  # of torchvision's BoundingBoxes
-    if form not in (None, "XYXY" if kind == "boxes" else kind.removeprefix("boxes_").upper()):
-        raise ValueError(
-            f"{owner}: {name} must be {KINDS[kind].shape}; got BoundingBoxes of the format {form}. Use "
-            "camtorch.augment.torchvision.Transform for them"
-        )
-
-
-def _check_corners(value: Tensor, name: str, owner: str) -> None:
-    _check_form("boxes", value, name, owner)
-    check_boxes(value, name, owner)
-
-
-def _check_pose(value: Tensor, name: str, owner: str) -> None:
-    if not value.is_cpu or value.requires_grad:
-        return
-    rotations = value[..., :3, :3]
-    if value.ndim == 2 and is_right(rotations):
-        return
-    wrong = ~are_rotations(rotations) & torch.isfinite(rotations).flatten(-2).all(-1)
-    if known_some(wrong):
-        check_rotation(rotations[wrong][:1], name, owner)
-
-
-def _check_pitch_yaw(value: Tensor, name: str, owner: str) -> None:
-    if not value.is_cpu or value.requires_grad:
-        return
-    # with room for the rounding of half precision
-    beyond = value.abs() > value.new_tensor([math.pi / 2, math.pi]) * 1.01
-    if known_some(beyond):
-        pitch, yaw = value[beyond.any(-1)][0].tolist()
-        raise ValueError(
-            f"{owner}: {name} must be radians, pitch within pi / 2 and yaw within pi; got {pitch:.6g}, {yaw:.6g}. "
-            "Degrees are converted by torch.deg2rad() or math.radians()"
-        )
-
-
-def from_pitch_yaw(angles: Tensor) -> Tensor:
-    """Return unit gaze vectors (..., 3) of pitch and yaw (..., 2) in radians, as in MPIIGaze and ETH-XGaze.
-
-    Zero looks into the camera, along -z. Source: Zhang et al., ETH-XGaze, 2020, and its code.
-
-    Raises:
-        ValueError: If the shape is wrong, or plain angles are more than a turn and so may be degrees.
-    """
-    angles = as_coordinates(angles, "angles", 2, "from_pitch_yaw")
-    check_angles(angles, "from_pitch_yaw")
-    pitch, yaw = angles.unbind(-1)
-    return torch.stack((-pitch.cos() * yaw.sin(), -pitch.sin(), -pitch.cos() * yaw.cos()), -1)
-
-
-def to_pitch_yaw(gaze: Tensor) -> Tensor:
-    """Return pitch and yaw (..., 2) in radians of gaze vectors (..., 3): pitch = asin(-y), yaw = atan2(-x, -z)."""
-    x, y, z = as_coordinates(gaze, "gaze", 3, "to_pitch_yaw").unbind(-1)
-    return torch.stack((torch.atan2(-y, torch.hypot(x, z)), torch.atan2(-x, -z)), -1)
 
 
 def _image_sampler(options: Options, mask_fill: float) -> Sampler:
@@ -274,18 +165,18 @@ _DIRECTIONS = Field(
     ends=[(3,)],
     shape="(B, *N, 3) directions of the camera frame",
     move=_by(Change.rays),
-    by_c="rays",
-    hint=_rays_hint,
+    together="rays",
+    hint=rays_hint,
 )
 _POSE = Field(
     dims=2,
     ends=[(4, 4), (3, 4)],
     shape="(B, 4, 4) or (B, 3, 4), camera from head",
     move=_pose,
-    by_c="pose",
+    together="pose",
     tells_batches=True,
-    hint=_pose_hint,
-    check=_check_pose,
+    hint=pose_hint,
+    check=check_pose,
 )
 # the order counts where several kinds would do: whether a sample is a batch, and what a wrong name may have meant
 KINDS = {
@@ -293,17 +184,17 @@ KINDS = {
         dims=3,
         shape="(B, C, H, W)",
         move=_by(Change.images),
-        by_c=_image_sampler,
+        together=_image_sampler,
         is_image=True,
         tells_batches=True,
-        hint=_image_hint,
+        hint=image_hint,
     ),
     "mask": Field(
         dims=2,
         most_dims=3,
         shape="(B, C, H, W) or (B, H, W)",
         move=_planes(_labels),
-        by_c=_mask_sampler,
+        together=_mask_sampler,
         is_image=True,
     ),
     "depth": Field(
@@ -311,7 +202,6 @@ KINDS = {
         most_dims=3,
         shape="(B, 1, H, W) or (B, H, W), along z",
         move=_planes(_by(Change.depth)),
-        by_c="never",
         is_image=True,
     ),
     "distance": Field(
@@ -319,7 +209,6 @@ KINDS = {
         most_dims=3,
         shape="(B, 1, H, W) or (B, H, W), along the ray",
         move=_planes(_by(Change.distance)),
-        by_c="never",
         is_image=True,
     ),
     "keypoints": Field(
@@ -328,29 +217,29 @@ KINDS = {
         ends=[(2,)],
         shape="(B, N, 2) or (B, F, N, 2) pixels x, y",
         move=_by(Change.points),
-        by_c="pixels",
+        together="pixels",
         tells_batches=True,
         in_pixels=True,
-        hint=_keypoints_hint,
+        hint=keypoints_hint,
     ),
     "polygons": Field(
         dims=3,
         ends=[(2,)],
         shape="(B, M, K, 2) corners x, y",
         move=_by(Change.points),
-        by_c="pixels",
+        together="pixels",
         tells_batches=True,
     ),
     "boxes": Field(
         dims=2,
         ends=[(4,)],
-        shape="(B, M, 4) pixels x1, y1, x2, y2",
+        shape=CORNERS,
         move=_by(Change.boxes),
-        by_c="boxes",
+        together="boxes",
         tells_batches=True,
         in_pixels=True,
-        hint=_boxes_hint,
-        check=_check_corners,
+        hint=boxes_hint,
+        check=check_corners,
     ),
     "boxes_xywh": _sided_boxes("boxes_xywh", "x, y, width, height"),
     "boxes_cxcywh": _sided_boxes("boxes_cxcywh", "x and y of the centre, width, height"),
@@ -362,7 +251,7 @@ KINDS = {
         move=lambda change, value, options: field_of("landmarks", value).move(change, value, options),
         tells_batches=True,
         in_pixels=True,
-        hint=_landmarks_hint,
+        hint=landmarks_hint,
     ),
     "points": Field(
         dims=1,
@@ -370,8 +259,8 @@ KINDS = {
         ends=[(3,)],
         shape="(B, *N, 3) points of the camera frame",
         move=_by(Change.positions),
-        by_c="rays",
-        hint=_column_hint,
+        together="rays",
+        hint=column_hint,
     ),
     "gaze": _DIRECTIONS,
     "directions": _DIRECTIONS,
@@ -381,7 +270,7 @@ KINDS = {
         ends=[(2,)],
         shape="(B, *N, 2) pitch and yaw of a gaze in radians",
         move=_by(Change.rays, from_pitch_yaw, to_pitch_yaw),
-        check=_check_pitch_yaw,
+        check=check_pitch_yaw,
     ),
     "head_pose": _POSE,
     "pose": _POSE,
@@ -390,9 +279,9 @@ KINDS = {
         ends=[(3,)],
         shape="(B, 3), a rotation vector, camera from head",
         move=_rvec,
-        by_c="rotation vectors",
+        together="rotation vectors",
         tells_batches=True,
-        hint=_column_hint,
+        hint=column_hint,
         check=check_radians,
     ),
     "tvec": Field(
@@ -400,17 +289,17 @@ KINDS = {
         ends=[(3,)],
         shape="(B, 3), a point of the camera frame",
         move=_by(Change.positions),
-        by_c="rays",
+        together="rays",
         tells_batches=True,
-        hint=_column_hint,
+        hint=column_hint,
     ),
     "rotation": Field(
         dims=2,
         ends=[(3,)],
         shape="(B, 3, 3), turned so far",
         move=_by(Change.rays, _columns, _columns),
-        by_c="columns",
-        hint=_column_hint,
+        together="columns",
+        hint=column_hint,
     ),
     "K": Field(
         dims=2, ends=SIDES, shape=SHAPE, move=moved_matrix, tells_batches=True, hint=matrix_hint, check=check_matrix

@@ -1,17 +1,17 @@
 """How a sample moves by a change: all that is the same for samples of one form is planned once.
 
-1. `form_of` says what a plan depends on. A sample that has no form, as one of lists, or in traced code, has a plan of
+1. `form_of` says what a plan depends on. A sample without a form, as one with a list, or in traced code, has a plan of
    its own. The plan is kept by the form, and `_new_batch` in `sample.py` makes it.
 2. A `SamplePlan` names the fields that move, and whether there is a dim B. A `Batch` is a sample with its plan.
-3. `SamplePlan.together` moves what it can by one call of C, also kept: images and pixels of samples that all move by
-   one warp, if nothing is recorded. Of a single sample whose camera C drew, it moves most other labels, too.
-4. `Batch.moved` moves each other field by itself: `move` calls what the table `KINDS` has for its kind.
+3. `Batch.together` moves what one call can move, by the column `together` of the table `KINDS`: of C, which each thread
+   keeps, or without the library of torch.
+4. `Batch.alone` moves each other field, by the column `move`.
 """
 
 import math
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from threading import get_ident
 from typing import Any, NamedTuple
 
 import torch
@@ -19,21 +19,30 @@ from torch import Tensor
 
 from camtorch.augment.change import Change
 from camtorch.augment.fields import KINDS, Named, field_of
-from camtorch.augment.part import LazyWarp, Part
+from camtorch.augment.part import LazyWarp
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
-from camtorch.evaluate.tensors import are_free, are_numbers, known_true
+from camtorch.evaluate.tensors import are_free, are_numbers
 from camtorch.native.library import native_available
-from camtorch.native.structs import EDGE_POINTS
+from camtorch.values.dtypes import in_range
 from camtorch.values.threads import thread_count
-from camtorch.warp.at_once import Label, MovedField, SampleCall, call_for
-from camtorch.warp.boxes import along_edges, around, corners_of, in_order
-from camtorch.warp.options import Options, Sampler
+from camtorch.warp.options import Options
+from camtorch.warp.together import How, Label, MovedField, SampleCall, Sizes, call_for, pixels_together
 
 # Labels of a single sample that one call of C moves beside pixels: where it may be mirrored, and where it is not
 _LABELS_OF_MIRRORS: Sequence[Label] = "boxes", "rays"
 _LABELS_OF_TURNS: Sequence[Label] = *_LABELS_OF_MIRRORS, "columns", "pose", "rotation vectors"
 _MANY_PIXELS = 1 << 15  # coordinates of a batch: so many are shared by threads
+
+
+class _OfThread(threading.local):
+    """What each thread has of its own: a call of C holds memory that one thread writes."""
+
+    def __init__(self) -> None:
+        self.calls = Kept(16)  # the last ones, of all transforms
+
+
+_own = _OfThread()
 
 
 def form_of(
@@ -53,23 +62,28 @@ def form_of(
             values += name, type(value)
         else:
             return None
-    # If tensors learn or are elsewhere, the plan is another, without a call of C; of traced calls none is kept
+    # If tensors learn or are elsewhere, the plan is another, which moves nothing together; of traced calls none is kept
     is_free = are_free(*tensors)
     if not is_free and not are_free():
         return None
-    # Each thread keeps plans of its own, as calls of C hold memory that one thread writes
-    state = revision, get_ident(), is_free
     intrinsics, distortion = camera.intrinsics, camera.distortion
     numbers = intrinsics.shape, intrinsics.dtype, intrinsics.device, distortion.shape
-    return *state, type(camera), camera.image_size, *numbers, type(sample), *values, *fields.items()
+    return revision, is_free, type(camera), camera.image_size, *numbers, type(sample), *values, *fields.items()
 
 
-class CallOfFields(NamedTuple):
-    """A call of C that moves several fields at once, and their names."""
+def form_together(named: Named, batched: bool, masks: Sequence[str], mask_fill: float) -> tuple[Any, ...] | None:
+    """Return all that a call for several fields depends on, beside the motion; None if each field moves alone.
 
-    names: Sequence[str]
-    narrowed: Sequence[str]  # of those, pixels and boxes that come out in another dtype than that of the cameras
-    call: SampleCall
+    These are of name -> kind and value; see `SamplePlan` for the others.
+    """
+    if "image_valid" in masks:  # which asks for the position of each pixel: the call would compute them once more
+        return None
+    values: list[Any] = []
+    for name, (kind, value) in named.items():
+        if isinstance(value, list) or not are_free(value):
+            return None
+        values += name, kind, type(value), value.shape, value.stride(), value.dtype
+    return batched, mask_fill, *values
 
 
 @dataclass(frozen=True)
@@ -82,132 +96,11 @@ class SamplePlan:
     matrices: Sequence[str]  # names of the fields that are matrices K
     masks: Sequence[str]  # names of the masks of validity that come out: "image_valid" and so on
     mask_fill: float
-    calls: Kept | None
-    """Maps settings to the `CallOfFields`, or to None if no call serves; None itself if autograd may record."""
+    form_together: tuple[Any, ...] | None  # what the function of that name returns
 
     def rows(self, value: Any) -> Any:
         """Return a value with a dim B; a list has one already."""
         return value if self.batched or isinstance(value, list) else value.unsqueeze(0)
-
-    def together(self, change: Change, values: Mapping[str, Any]) -> Mapping[str, MovedField | None]:
-        """Move by one call of C: images, pixels, and of a single sample whose camera C drew also boxes and rays.
-
-        A `LazyWarp` goes to such a camera. Without the library, pixels and boxes move by one evaluation in torch. The
-        other fields, and all of them if no call serves, are not in the result, or None.
-        """
-        part, calls = change.parts[0], self.calls
-        motion = part.motion
-        # 1. One call moves all rows by one warp, and records nothing
-        if calls is None or motion is None or part.rows is not None or change.gate is not None or not self.count:
-            return {}
-        if not native_available():
-            return self._pixels_at_once(part, values)
-        # 2. C needs both cameras, and a camera, or a turn, for each row; images whose colours or light change go alone
-        natives = None if part.shades or part.light is not None else motion.natives
-        if natives is None:
-            return {}
-        source, target = natives
-        rotation = motion.rotation
-        if self.count > 1:
-            turns = 1 if rotation is None else rotation.numel() // 9
-            if self.count not in (source.cameras, target.cameras, turns):
-                return {}
-        # 3. The call is kept by all that it depends on, beside the form
-        labels: Sequence[Label] = ()
-        if isinstance(motion, LazyWarp) and self.count == 1:
-            labels = _LABELS_OF_MIRRORS if motion.may_mirror else _LABELS_OF_TURNS
-        size = motion.image_size
-        settings = size, source.dtype, labels, thread_count(), *motion.options.values()
-        how = values, part.camera, size, source.dtype, motion.options, labels
-        of_fields: CallOfFields | None = calls.get((), settings, self._new_call, *how)
-        if of_fields is None:
-            return {}
-        # 4. The call moves its fields, or refuses the values
-        moved = of_fields.call(source, target, rotation, [*map(values.__getitem__, of_fields.names)])
-        if moved is None:
-            return {}
-        results = dict(zip(of_fields.names, moved, strict=True))
-        for name in of_fields.narrowed:
-            pair = results[name]
-            if pair is not None:
-                results[name] = _in_range(pair[0], values[name].dtype), pair[1]
-        return results
-
-    def _new_call(
-        self,
-        values: Mapping[str, Any],
-        camera: Camera,
-        size: tuple[int, int],
-        dtype: torch.dtype,
-        options: Options,
-        labels: Sequence[Label],
-    ) -> CallOfFields | None:
-        """Return the call of C that moves several fields; None if no call serves.
-
-        camera, size: of the images, and of the new ones. dtype, options: as of `call_for`. labels: those that it moves
-        beside pixels.
-        """
-        hows: dict[str, Sampler | Label] = {}
-        for name, kind in self.fields.items():
-            value = values[name]
-            if isinstance(value, list) or field_of(kind, value).by_c == "never":
-                return None
-            how = self._how_of(kind, value, dtype, options, labels)
-            if how is not None:
-                hows[name] = how
-        if not hows:
-            return None
-        sizes = camera.size_for("Warp"), size
-        call = call_for(sizes, dtype, options, [values[name] for name in hows], [*hows.values()], self.batched)
-        if call is None:
-            return None
-        narrowed = [name for name, how in hows.items() if how in ("pixels", "boxes") and values[name].dtype != dtype]
-        return CallOfFields([*hows], narrowed, call)
-
-    def _how_of(
-        self, kind: str, value: Tensor, dtype: torch.dtype, options: Options, labels: Sequence[Label]
-    ) -> Sampler | Label | None:
-        """Return how one call of C moves a value, see `_new_call`; None if it does not."""
-        how: Any = field_of(kind, value).by_c
-        if how is None or value.ndim - self.batched > KINDS[kind].most_dims:  # frames move by `move`
-            return None
-        if callable(how):
-            sampler: Sampler = how(options, self.mask_fill)
-            return sampler if len(sampler.fill) == 1 or len(sampler.fill) == value.shape[-3] else None
-        label: Label = how
-        if label == "pixels":
-            return label if self.count == 1 or value.numel() < _MANY_PIXELS else None
-        if label not in labels or value.dtype != dtype or not are_numbers(value):
-            return None
-        return label if label == "boxes" or value.is_contiguous() else None
-
-    def _pixels_at_once(self, part: Part, values: Mapping[str, Any]) -> dict[str, MovedField]:
-        """Move all pixels and boxes by one evaluation of the cameras: in torch each takes hundreds of operations."""
-        warp, dtype = part.warp, part.camera.intrinsics.dtype
-        given: dict[str, Tensor] = {}
-        outlines: list[Tensor] = []
-        for name, kind in self.fields.items():
-            value = values[name]
-            if isinstance(value, list) or value.dtype != dtype or value.ndim - self.batched > KINDS[kind].most_dims:
-                continue
-            how = field_of(kind, value).by_c
-            if how == "pixels" or (how == "boxes" and known_true(in_order(value).all())):
-                given[name] = rows = self.rows(value)
-                outlines.append(rows if how == "pixels" else along_edges(corners_of(rows), EDGE_POINTS))
-        if len(given) < 2 or not warp.moves_by_cameras:  # others move points by more than their cameras
-            return {}
-        moved, mapped = warp.move(torch.cat([outline.flatten(1, -2) for outline in outlines], 1))
-        counts = [outline.shape[1:-1].numel() for outline in outlines]
-        pairs = zip(moved.split(counts, 1), mapped.split(counts, 1), strict=True)
-        results: dict[str, MovedField] = {}
-        for (name, rows), outline, pair in zip(given.items(), outlines, pairs, strict=True):
-            places, seen = pair[0].reshape(outline.shape), pair[1].reshape(outline.shape[:-1])
-            if outline is rows:
-                seen = seen & warp.target.contains(places)
-            else:
-                places, seen = around(warp, corners_of(rows), places, seen)
-            results[name] = (places, seen) if self.batched else (places.squeeze(0), seen.squeeze(0))
-        return results
 
 
 class Batch(NamedTuple):
@@ -222,7 +115,75 @@ class Batch(NamedTuple):
         """Return name -> kind and value, with a dim B."""
         return {name: (kind, self.plan.rows(self.values[name])) for name, kind in self.plan.fields.items()}
 
-    def moved(self, name: str, change: Change, options: Mapping[str, float], owner: str) -> tuple[Any, Any]:
+    def together(self, change: Change) -> Mapping[str, MovedField | None]:
+        """Move fields by one call, of C or without the library of torch; what is not in the result, or None, is left.
+
+        C moves images and pixels, and of a single sample whose camera C drew also boxes, rays, columns, poses and
+        rotation vectors; it takes a `LazyWarp` without making a warp. Torch moves pixels and boxes.
+        """
+        plan, part = self.plan, change.parts[0]
+        motion, form, count = part.motion, plan.form_together, plan.count
+        # 1. One motion moves all rows, and nothing is recorded
+        if form is None or motion is None or part.rows is not None or change.gate is not None or not count:
+            return {}
+        options = motion.options
+        if not native_available():
+            hows = self._hows(part.camera.intrinsics.dtype, options, ["boxes"])
+            return pixels_together(part.warp, self.values, hows, plan.batched)
+        # 2. C needs both cameras, and a camera, or a turn, for each row; images whose colours or light change go alone
+        natives = None if part.shades or part.light is not None else motion.natives
+        if natives is None:
+            return {}
+        source, target = natives
+        rotation = motion.rotation
+        if count > 1:
+            turns = 1 if rotation is None else rotation.numel() // 9
+            if count not in (source.cameras, target.cameras, turns):
+                return {}
+        # 3. The call is kept by all that it depends on
+        labels: Sequence[Label] = ()
+        if isinstance(motion, LazyWarp) and count == 1:
+            labels = _LABELS_OF_MIRRORS if motion.may_mirror else _LABELS_OF_TURNS
+        sizes = part.camera.image_size, motion.image_size
+        key = form, sizes, source.dtype, labels, thread_count(), *options.values()
+        call: SampleCall | None = _own.calls.get((), key, self._new_call, sizes, source.dtype, options, labels)
+        return {} if call is None else call(source, target, rotation, self.values)
+
+    def _new_call(
+        self, sizes: Sizes, dtype: torch.dtype, options: Options, labels: Sequence[Label]
+    ) -> SampleCall | None:
+        """Return the call of C that moves several fields; None if none serves, or if an image moves alone.
+
+        sizes: of the images and of the new ones. dtype, options: as of `call_for`. labels: those that it moves beside
+        pixels.
+        """
+        kinds = [KINDS[kind] for kind in self.plan.fields.values()]
+        hows = self._hows(dtype, options, labels)
+        if not hows or any(kind.is_image and kind.together is None for kind in kinds):
+            return None
+        return call_for(sizes, dtype, options, self.values, hows, self.plan.batched)
+
+    def _hows(self, dtype: torch.dtype, options: Options, labels: Sequence[Label]) -> dict[str, How]:
+        """Return name -> how it moves with others, for the fields that do; see `_new_call`."""
+        hows = {name: self._how_of(name, dtype, options, labels) for name in self.plan.fields}
+        return {name: how for name, how in hows.items() if how is not None}
+
+    def _how_of(self, name: str, dtype: torch.dtype, options: Options, labels: Sequence[Label]) -> How | None:
+        plan, value = self.plan, self.values[name]
+        kind = plan.fields[name]
+        how = field_of(kind, value).together
+        if how is None or value.ndim - plan.batched > KINDS[kind].most_dims:  # frames move by `move`
+            return None
+        if callable(how):
+            sampler = how(options, plan.mask_fill)
+            return sampler if len(sampler.fill) == 1 or len(sampler.fill) == value.shape[-3] else None
+        if how == "pixels":
+            return how if plan.count == 1 or value.numel() < _MANY_PIXELS else None
+        if how not in labels or value.dtype != dtype or not are_numbers(value):
+            return None
+        return how if how == "boxes" or value.is_contiguous() else None
+
+    def alone(self, name: str, change: Change, options: Mapping[str, float], owner: str) -> tuple[Any, Any]:
         """Return a field after a change, with a dim B or as a list if it came so, and which of it is valid, if any."""
         kind, value, batched = self.plan.fields[name], self.values[name], self.plan.batched
         if isinstance(value, list):
@@ -246,12 +207,4 @@ def move(change: Change, kind: str, value: Tensor, options: Mapping[str, float])
     result = KINDS[kind].move(change, value, options)
     result, valid = result if isinstance(result, tuple) else (result, None)
     # geometry is computed in float32 at least; what came in half precision goes out in it
-    return _in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid
-
-
-def _in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return values in a dtype, which may be narrower: finite values stay finite."""
-    if dtype == torch.float16 != values.dtype:
-        most = torch.finfo(dtype).max
-        values = values.clamp(-most, most)
-    return values.to(dtype)
+    return in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, ParamSpec, Self, TypedDict, TypeVar, cast
 import torch
 from torch import Tensor, nn
 
-from camtorch.augment.cameras import Unknown, camera_of_images
+from camtorch.augment.cameras import Unknown, camera_of_images, known_camera
 from camtorch.augment.change import Change, one_or_batch
 from camtorch.augment.clips import Clips
 from camtorch.augment.devices import remember_camera
@@ -18,7 +18,7 @@ from camtorch.augment.fields import FRONT_ENDS, IMAGES, PLACE
 from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess, check_agrees, check_targets, refuse
 from camtorch.augment.names import check_kinds
-from camtorch.augment.plan import Batch, SamplePlan, form_of, move
+from camtorch.augment.plan import Batch, SamplePlan, form_of, form_together, move
 from camtorch.augment.reading import check_cameras, check_fields, is_batch, moving
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
@@ -71,9 +71,9 @@ class KeepsCamera:
 
 
 class Calls:
-    """The state that calls leave in a transform. Copies and pickles begin anew, with the bytes of an unused one."""
+    """What the calls of a transform leave for later ones. Copies and pickles are those of a transform without calls."""
 
-    last: Change | None = None
+    last: Change | None = None  # which `inverse` undoes
     is_first: bool = False  # whether the last sample came without a rotation
     has_looked: bool = False  # whether new images were found to be filled or not: calls warn once
 
@@ -222,13 +222,10 @@ class SampleTransform(KeepsCamera, nn.Module):
         camera: instead of the sample's. predicted: values come from a network, and are not checked.
         kinds: name -> kind, in addition to `fields`.
         """
-        camera = sample.get("camera") if camera is None else camera
+        camera = known_camera(sample.get("camera") if camera is None else camera, self.camera)
         fields = {**self.fields, **kinds} if kinds else self.fields
-        if camera is None or isinstance(camera, Guess):  # as `known_camera` of `cameras.py`, without a call
-            guess, camera = camera or vars(self).get("camera"), self._modules.get("camera")
-            if camera is None:
-                named = moving(sample, fields, self._name)
-                camera = camera_of_images(named, guess, self.needs_camera, self._name)
+        if camera is None or isinstance(camera, Guess):
+            camera = camera_of_images(moving(sample, fields, self._name), camera, self.needs_camera, self._name)
         form = form_of(sample, camera, fields, self._calls.revision)
         plan = None if form is None else self._calls.plans.get((), form)
         if plan is not None:
@@ -257,7 +254,8 @@ class SampleTransform(KeepsCamera, nn.Module):
             name: t for name, (_, value) in named.items() for t in (value if isinstance(value, list) else [value])
         }
         check_devices(owner, **tensors)
-        device, camera = next((t.device for t in tensors.values()), torch.device("cpu")), one_or_batch(camera)
+        camera = one_or_batch(camera)
+        device = next((t.device for t in tensors.values()), torch.device("cpu"))
         if device.type == "cpu" and are_free():
             warn_if_missing()
         if camera.intrinsics.device != device:
@@ -267,9 +265,9 @@ class SampleTransform(KeepsCamera, nn.Module):
         kinds = {name: kind for name, (kind, _) in named.items()}
         flags = dict.fromkeys(["image_valid", *(f"{name}_valid" for name, kind in kinds.items() if kind in IMAGES)])
         masks = [key for key in flags if sample.get(key) is not None or (self.valid_mask and key == "image_valid")]
-        calls = Kept() if are_free(*tensors.values()) else None
+        form = form_together(named, batched, masks, self.mask_fill)
         matrices = [name for name, kind in kinds.items() if kind == "K"]
-        plan = SamplePlan(kinds, batched, count, matrices, masks, self.mask_fill, calls)
+        plan = SamplePlan(kinds, batched, count, matrices, masks, self.mask_fill, form)
         return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, must_check=False)
 
     def _check_matrices(self, batch: Batch, sample: Sample) -> None:
@@ -323,13 +321,12 @@ class SampleTransform(KeepsCamera, nn.Module):
         if plan.matrices:
             check_targets(plan.fields, change, self._name)
         moved = dict(sample)
-        # `image_valid` asks for the position of each pixel, which the call of C would compute once more
-        together = {} if "image_valid" in plan.masks else plan.together(change, batch.values)
+        together = batch.together(change)
         for name in plan.fields:
             pair = together.get(name)
             if pair is None:
                 options = {"mask_fill": self.mask_fill, "lateral": mirroring.lateral if mirroring else 0}
-                pair = batch.moved(name, change, options, self._name)
+                pair = batch.alone(name, change, options, self._name)
             moved[name], valid = pair
             if valid is not None:
                 key = f"{name}_valid"

@@ -48,6 +48,14 @@ def narrow(values: Tensor, dtype: torch.dtype) -> Tensor:
     return values.to(dtype)
 
 
+def in_range(values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return values in a dtype of floating point, which may be narrower: finite values stay finite."""
+    if dtype == torch.float16 != values.dtype:
+        most = torch.finfo(dtype).max
+        values = values.clamp(-most, most)
+    return values.to(dtype)
+
+
 def as_pixels(fill: Sequence[float], dtype: torch.dtype, device: torch.device | str = "cpu") -> Tensor:
     """Return the values (C or 1, 1, 1) of channels in a dtype: rounded, in range, true from one half on."""
     values: Sequence[float] = fill

@@ -164,7 +164,7 @@ def test_rotation_vectors_turn_by_the_formulas_of_torch(dtype, scale):
         draw = {key: value[i : i + 1] for key, value in draws.items()}
         singles.append(augment(rvec=vector, draw=draw)["rvec"])
         rotations.append(augment.last.rotation[0] @ rotation_matrix(vector))
-        assert not native_available() or augment._calls.plans.result.calls.result[0] == ["rvec"]  # a call of C turns it
+        assert not native_available() or [*camtorch.augment.plan._own.calls.result._readers] == ["rvec"]  # C turns it
     turned, wanted, tolerance = torch.stack(singles), torch.stack(rotations), 8 * torch.finfo(dtype).eps
     assert turned.dtype == dtype
     torch.testing.assert_close(rotation_matrix(turned), wanted, rtol=0, atol=tolerance)
@@ -272,7 +272,7 @@ def test_odd_samples_as_step_by_step(form, name, monkeypatch):
         torch.manual_seed(0)
         out = augment(sample, camera=camera)
     monkeypatch.setattr(camtorch.augment.plan, "call_for", lambda *given: None)
-    augment._calls.plans = Kept(16)
+    camtorch.augment.plan._own.calls = Kept(16)
     torch.manual_seed(0)
     expected = augment(sample, camera=camera)
     assert out.keys() == expected.keys()
@@ -316,7 +316,7 @@ def test_what_is_ready_heeds_changes(change, kind):
         sample = {**sample_for(torch.float32), **vectors, "pitch_yaw": torch.tensor([0.1, 0.2])}
         for _ in range(calls):
             augment(sample, camera=camera)
-        assert not calls or augment._calls.plans.result.calls.result[1] is not None  # a call of C serves it
+        assert not calls or not native_available() or camtorch.augment.plan._own.calls.result is not None  # C serves it
         CHANGES[change](augment, camera)
         torch.manual_seed(1)
         outs.append(augment(sample, camera=camera))
@@ -348,3 +348,29 @@ def test_samples_of_any_form_follow_each_other():
     ):
         with pytest.raises(ValueError, match=text):
             transform({"image": image, **fields})
+
+
+@pytest.mark.skipif(not native_available(), reason="calls of C are kept")
+def test_a_thread_keeps_few_calls_however_many_augmentations_move_samples():
+    """A call holds a lattice of its own. Augmentations of the same options share one."""
+    camera, calls = example("pinhole", SIZE).requires_grad_(False), camtorch.augment.plan._own.calls
+    A.RandomMount(camera=camera)(sample_for(torch.float32))
+    known = calls.result
+    for fill in range(20):
+        A.RandomMount(camera=camera)(sample_for(torch.float32))
+        assert calls.result is known
+        A.RandomMount(camera=camera, fill=fill + 1)(sample_for(torch.float32))
+    assert len(calls._kept) == calls.capacity == 16
+
+
+class Tagged(torch.Tensor):
+    """A class of tensors, which results keep."""
+
+
+def test_calls_of_plain_labels_serve_no_labels_of_another_class():
+    camera, sample = example("pinhole", SIZE).requires_grad_(False), sample_for(torch.float32)
+    labels = {"boxes": torch.tensor([[20.0, 20, 60, 50]]), "gaze": torch.tensor([0.0, 0, -1])}
+    A.RandomMount(camera=camera)({**sample, **labels})
+    out = A.RandomMount(camera=camera)(sample, **{name: value.as_subclass(Tagged) for name, value in labels.items()})
+    assert isinstance(out["boxes"], Tagged)
+    assert isinstance(out["gaze"], Tagged)

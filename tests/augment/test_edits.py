@@ -13,7 +13,7 @@ import camtorch as ct
 import camtorch.augment.numpy
 from camtorch.poses import rotations
 from camtorch.values.arguments import TOLD
-from camtorch.warp import at_once, sampling
+from camtorch.warp import sampling, together
 
 A = ct.augment
 SIZE = (48, 64)
@@ -321,7 +321,7 @@ def test_a_chain_is_one_resampling(monkeypatch):
         return call
 
     call = camtorch.native.sampler.NativeJob
-    for module, name in ((call, "__call__"), (sampling, "_within_memory"), (at_once.SampleCall, "__call__")):
+    for module, name in ((call, "__call__"), (sampling, "_within_memory"), (together.SampleCall, "__call__")):
         monkeypatch.setattr(module, name, watched(getattr(module, name)))
     mixture()(image=torch.randint(0, 256, (4, 3, 96, 128), dtype=torch.uint8), camera=lens)
     assert sum(made) == 1

@@ -1,38 +1,42 @@
-"""One call of C for a sample: its images, masks, pixels, boxes, rays and poses. For a batch images and pixels."""
+"""Fields of samples that move together: by one call of C, or without the library pixels and boxes in torch."""
 
 from __future__ import annotations
 
 import functools
 import math
-import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from camtorch.evaluate.kept import Kept
+from camtorch.evaluate.tensors import known_true
 from camtorch.native import memory, structs
 from camtorch.native.library import loaded
 from camtorch.native.sampler import describe, is_quick, maker, takes, tiles_of
 from camtorch.projection.native_cameras import Native
 from camtorch.projection.native_moves import NativeLattices, NativeMove, follow, run_and_follow
+from camtorch.values.dtypes import in_range
 from camtorch.values.threads import spread, thread_count
+from camtorch.warp.boxes import along_edges, around, corners_of, in_order
 from camtorch.warp.lattice import FEWEST_CELLS, MOST_KEPT_NODES, coarse, probes
 from camtorch.warp.options import Options, Sampler, serving_all
 from camtorch.warp.sampling import SHRINKS, SURELY
+from camtorch.warp.warp import Warp
 
 Label = Literal["pixels", "boxes", "rays", "columns", "pose", "rotation vectors"]
 """What moves beside images: pixels, boxes, directions and points of the camera frame, or columns of such in a matrix,
 of which those of a pose begin with a rotation; or rotation vectors."""
+How = Sampler | Label
+"""How images are sampled, or which label a value is."""
 MovedField = tuple[Tensor, Tensor | None]
 """A value after a move, and which of it is valid, if it has validity."""
 Reader = Callable[[Tensor], MovedField]
 """Has C read a value, and returns its results."""
 Sizes = tuple[tuple[int, int], tuple[int, int]]  # (height, width) of the source's image, and of the target's
 
-_FORMS = {"pose": structs.POSE, "rotation vectors": structs.ROTATION_VECTORS}  # others are rays
+_FORMS: dict[How, int] = {"pose": structs.POSE, "rotation vectors": structs.ROTATION_VECTORS}  # others are rays
 _TILES_FOR_ONE_THREAD = 2  # an image of no more is made by one
 _SAMPLES_PER_THREAD = 4  # with as many, threads that idle at the end matter little
 
@@ -41,11 +45,11 @@ def call_for(
     sizes: Sizes,
     dtype: torch.dtype,
     options: Options,
-    values: Sequence[Tensor],
-    hows: Sequence[Sampler | Label],
+    values: Mapping[str, Tensor],
+    hows: Mapping[str, How],
     batched: bool,
 ) -> SampleCall | None:
-    """Return the call of native code that moves all that samples of a form hold; a thread keeps the last ones.
+    """Return the call of native code that moves all that samples of a form hold.
 
     None if no lattice serves, images shrink or have unusual strides, or threads would idle: each takes whole samples.
 
@@ -53,42 +57,38 @@ def call_for(
         sizes: of both images.
         dtype: of the cameras' numbers.
         options: of the warp.
-        values: on the CPU and without a graph: images (B, C, H, W), masks (B, H, W) as well, and labels.
-        hows: what values are. Labels are pixels (B, *N, 2) of the source's image; of a single sample boxes too, and, in
-            the dtype of the cameras, rays and rotation vectors (*N, 3) and columns (3 or 4, N) that turn.
+        values: on the CPU and without a graph, by name: images (B, C, H, W), masks (B, H, W) as well, and labels.
+        hows: name -> what a value is. Labels are pixels (B, *N, 2) of the source's image; of a single sample boxes
+            too, and, in the dtype of the cameras, rays and rotation vectors (*N, 3), columns (3 or 4, N) that turn,
+            and poses (3 or 4, 4).
         batched: whether there is a dim B.
     """
     tolerance, antialias = options["tolerance"], options["antialias"]
     if not tolerance or antialias:
         return None
-    count = len(values[0]) if batched else 1
-    if count > 1:
-        threads = thread_count()
-        if dtype != torch.float32 or (count % threads and count < _SAMPLES_PER_THREAD * threads):
+    count = _count_of(values, batched)
+    threads = thread_count()
+    if count > 1 and (dtype != torch.float32 or (count % threads and count < _SAMPLES_PER_THREAD * threads)):
+        return None
+    n, m = (math.ceil(side / structs.STEP) for side in sizes[1])
+    # too small for a lattice, or too large to be kept
+    if min(n, m) < FEWEST_CELLS or (n + 5) * (m + 5) > MOST_KEPT_NODES:
+        return None
+    for name, how in hows.items():
+        value = values[name]
+        if isinstance(how, Sampler):
+            image = _as_images(value, batched)
+            result = maker(image, count, sizes[1])()
+            serves = 0 not in result.shape and takes(image.dtype, how.mode) and is_quick(image, result, how.mode)
+        else:
+            serves = torch.promote_types(value.dtype, dtype) == dtype
+        if not serves:
             return None
-
-    def made() -> SampleCall | None:
-        n, m = (math.ceil(side / structs.STEP) for side in sizes[1])
-        # too small for a lattice, or too large to be kept
-        if min(n, m) < FEWEST_CELLS or (n + 5) * (m + 5) > MOST_KEPT_NODES:
-            return None
-        for value, how in zip(values, hows, strict=True):
-            if isinstance(how, Sampler):
-                image = _as_images(value, batched)
-                result = maker(image, count, sizes[1])()
-                serves = 0 not in result.shape and takes(image.dtype, how.mode) and is_quick(image, result, how.mode)
-            else:
-                serves = torch.promote_types(value.dtype, dtype) == dtype
-            if not serves:
-                return None
-        return SampleCall(sizes, dtype, options, values, hows, batched)
-
-    forms = [(t.shape, t.stride(), t.dtype, how) for t, how in zip(values, hows, strict=True)]
-    calls: Kept = _calls.__dict__.setdefault("kept", Kept(4))
-    return calls((), (sizes, dtype, tolerance, antialias, batched, *forms), made)
+    return SampleCall(sizes, dtype, options, values, hows, batched)
 
 
-_calls = threading.local()  # a thread keeps calls of its last four forms, which have memory of their own
+def _count_of(values: Mapping[str, Tensor], batched: bool) -> int:
+    return len(next(iter(values.values()))) if batched else 1
 
 
 @functools.lru_cache(maxsize=16)
@@ -115,7 +115,7 @@ def _surely_keeps_size(back: NativeMove, sizes: Sizes) -> bool:
     return bool((total < SURELY * SHRINKS * step * np.maximum(count, 1)).all())
 
 
-def _is_averaged(value: Tensor, how: Sampler | Label) -> bool:
+def _is_averaged(value: Tensor, how: How) -> bool:
     """Whether a value is an image whose pixels are averaged."""
     return isinstance(how, Sampler) and how.mode != "nearest" and value.dtype != torch.bool
 
@@ -143,8 +143,8 @@ def _image_maker(value: Tensor, batched: bool, make: Callable[[], Tensor]) -> Ca
 class SampleCall:
     """`Together` of geometry.h for samples of one form.
 
-    What they have in common is written once, when the call is made. Each run writes what a draw changes: both cameras,
-    the rotation, and where values and results lie.
+    What they have in common is written once, when the call is made, for as many threads as there are. Each run writes
+    what a draw changes: both cameras, the rotation, and where values and results lie.
     """
 
     def __init__(
@@ -152,29 +152,32 @@ class SampleCall:
         sizes: Sizes,
         dtype: torch.dtype,
         options: Options,
-        values: Sequence[Tensor],
-        hows: Sequence[Sampler | Label],
+        values: Mapping[str, Tensor],
+        hows: Mapping[str, How],
         batched: bool,
     ):
         """Take the arguments of `call_for`."""
         self._sizes, self._dtype, self._batched = sizes, dtype, batched
-        self._count = len(values[0]) if batched else 1
+        self._count, self._threads = _count_of(values, batched), thread_count()
         self._call = structs.Together()
-        samplers = {i: how for i, how in enumerate(hows) if isinstance(how, Sampler)}
-        pixels = {i: how for i, how in enumerate(hows) if how in ("pixels", "boxes")}
-        vectors = {i: how for i, how in enumerate(hows) if i not in samplers and i not in pixels}
+        samplers = {name: how for name, how in hows.items() if isinstance(how, Sampler)}
+        pixels = {name: how for name, how in hows.items() if how in ("pixels", "boxes")}
+        vectors = {name: how for name, how in hows.items() if name not in samplers and name not in pixels}
         self._lattices = self._lattices_of(samplers.values(), float(options["tolerance"] or 0))
         self._back = self._call.lattices.move  # from the target to the source, which images are sampled by
         readers = self._read_images(samplers, values) | self._read_pixels(pixels, values)
         readers |= self._read_vectors(vectors, values)
-        self._readers = [readers[i] for i in range(len(hows))]
-        self._copied = [i for i in pixels if values[i].dtype != dtype or not values[i].is_contiguous()]
-        self._may_be_refused = [i for i, how in enumerate(hows) if how in ("boxes", "pose", "rotation vectors")]
+        self._readers = {name: readers[name] for name in hows}
+        self._copied = [name for name in pixels if values[name].dtype != dtype or not values[name].is_contiguous()]
+        self._narrowed = {name: values[name].dtype for name in pixels if values[name].dtype != dtype}
+        self._may_be_refused = [name for name, how in hows.items() if how in ("boxes", "pose", "rotation vectors")]
         # whether each run asks if images shrink: these are halved elsewhere
-        self._may_halve = options["antialias"] is None and any(map(_is_averaged, values, hows))
+        averaged = [name for name, how in samplers.items() if _is_averaged(values[name], how)]
+        self._may_halve = options["antialias"] is None and len(averaged) > 0
         self._images_of_call = len(samplers) if self._count == 1 else 0  # those of a batch are made with their lattices
         self._tiles = tiles_of(sizes[1])  # of an image, which threads share
-        self._is_small = self._tiles <= _TILES_FOR_ONE_THREAD or not self._images_of_call  # one thread makes all
+        # whether one thread makes images and labels
+        self._is_whole = self._tiles <= _TILES_FOR_ONE_THREAD or not self._images_of_call or self._threads == 1
 
     def _lattices_of(self, samplers: Iterable[Sampler], tolerance: float) -> NativeLattices:
         """Return the lattices by which all images are sampled, of which C has the struct."""
@@ -187,8 +190,8 @@ class SampleCall:
         self._call.lattices = made.struct
         return made
 
-    def _read_images(self, samplers: Mapping[int, Sampler], values: Sequence[Tensor]) -> dict[int, Reader]:
-        """Give C the images and masks, and return their readers, by their places among the values."""
+    def _read_images(self, samplers: Mapping[str, Sampler], values: Mapping[str, Tensor]) -> dict[str, Reader]:
+        """Give C the images and masks, and return their readers by name."""
         call = self._call
         jobs = self._jobs = (structs.Job * len(samplers))()
         call.jobs, call.job_count = call.keep(jobs), len(jobs)
@@ -196,7 +199,8 @@ class SampleCall:
             call.lattices.jobs, call.lattices.job_count = call.jobs, call.job_count
         else:
             self._back.next = None  # one thread makes the lattice, and needs no counter of those made
-        return {i: self._image_reader(job, values[i], samplers[i]) for i, job in zip(samplers, jobs, strict=True)}
+        pairs = zip(samplers.items(), jobs, strict=True)
+        return {name: self._image_reader(job, values[name], how) for (name, how), job in pairs}
 
     def _image_reader(self, job: structs.Job, like: Tensor, how: Sampler) -> Reader:
         """Write into a job what all runs share; return what writes the rest in each run."""
@@ -214,14 +218,15 @@ class SampleCall:
 
         return read
 
-    def _read_pixels(self, hows: Mapping[int, Any], values: Sequence[Tensor]) -> dict[int, Reader]:
-        """Give C the pixels and boxes, and return their readers, by their places among the values."""
+    def _read_pixels(self, hows: Mapping[str, How], values: Mapping[str, Tensor]) -> dict[str, Reader]:
+        """Give C the pixels and boxes, and return their readers by name."""
         call = self._call
         moves = (structs.Move * len(hows))()
         call.moves, call.move_count = call.keep(moves), len(moves)
-        return {i: self._pixel_reader(move, values[i], hows[i]) for i, move in zip(hows, moves, strict=True)}
+        pairs = zip(hows.items(), moves, strict=True)
+        return {name: self._pixel_reader(move, values[name], how) for (name, how), move in pairs}
 
-    def _pixel_reader(self, move: structs.Move, like: Tensor, how: Any) -> Reader:
+    def _pixel_reader(self, move: structs.Move, like: Tensor, how: How) -> Reader:
         """Write into a move what all runs share; return what writes the rest in each run."""
         dtype, back = self._dtype, self._back
         turn_strides: Any = back.turn_strides
@@ -244,14 +249,15 @@ class SampleCall:
 
         return read
 
-    def _read_vectors(self, hows: Mapping[int, Any], values: Sequence[Tensor]) -> dict[int, Reader]:
-        """Give C the rays and what turns like them, and return their readers, by their places among the values."""
+    def _read_vectors(self, hows: Mapping[str, How], values: Mapping[str, Tensor]) -> dict[str, Reader]:
+        """Give C the rays and what turns like them, and return their readers by name."""
         call = self._call
         turns = (structs.Turned * len(hows))()
         call.turned, call.turned_count = call.keep(turns), len(turns)
-        return {i: self._vector_reader(turn, values[i], hows[i]) for i, turn in zip(hows, turns, strict=True)}
+        pairs = zip(hows.items(), turns, strict=True)
+        return {name: self._vector_reader(turn, values[name], how) for (name, how), turn in pairs}
 
-    def _vector_reader(self, turned: structs.Turned, like: Tensor, how: Any) -> Reader:
+    def _vector_reader(self, turned: structs.Turned, like: Tensor, how: How) -> Reader:
         """Write into what turns what all runs share; return what writes the rest in each run."""
         back, width = self._back, like.shape[-1]
         is_matrix = how in ("columns", "pose")
@@ -267,12 +273,12 @@ class SampleCall:
         return read
 
     def __call__(
-        self, source: Native, target: Native, rotation: Tensor | None, values: Sequence[Tensor]
-    ) -> list[MovedField | None] | None:
+        self, source: Native, target: Native, rotation: Tensor | None, values: Mapping[str, Tensor]
+    ) -> dict[str, MovedField | None]:
         """Move `values` of the form from one camera to another; also return which pixels and boxes are valid.
 
-        None if the call does not serve. Those of boxes, poses and rotation vectors alone are None if some take more
-        than their outline, or are none.
+        Nothing if the call does not serve. Boxes, poses and rotation vectors alone are None if some boxes take more
+        than their outline, or some rotations are none.
         """
         call, back, dtype = self._call, self._back, self._dtype
         turn, step = None, 0  # the address of the rotations, and how many numbers further the next one lies
@@ -284,7 +290,7 @@ class SampleCall:
         if self._may_halve:
             turns = None if rotation is None else rotation.mT
             if not _surely_keeps_size(NativeMove(target, source, turns, self._sizes[0], False), self._sizes):
-                return None
+                return {}
         # what a draw changes: cameras and rotation, and where values and results lie
         target.add_table()
         if call.move_count:
@@ -292,20 +298,21 @@ class SampleCall:
         back.from_, back.to = target.pointer, source.pointer
         back.turns, back.turn_strides[0] = turn, step
         if self._copied:
-            values = [value.to(dtype).contiguous() if i in self._copied else value for i, value in enumerate(values)]
-        results: list[MovedField | None] = [read(value) for read, value in zip(self._readers, values, strict=True)]
-        native, threads = loaded(), thread_count()
+            values = {**values, **{name: values[name].to(dtype).contiguous() for name in self._copied}}
+        results: dict[str, MovedField | None] = {}
+        for name, read in self._readers.items():
+            results[name] = read(values[name])
+        native = loaded()
         # images of a batch, by the threads that make the lattices
         if self._count > 1 and len(self._jobs):
             run, counters = native.camtorch_lattices, self._lattices.counters
             if run_and_follow(run, call.lattices, self._count, counters, target, source):
-                return None
+                return {}
         # all else, again if a limit of a camera was missing; images too if one thread makes them, else their lattice
-        one_thread = self._is_small or threads == 1
-        call.job_count, call.is_whole = self._images_of_call, one_thread
+        call.job_count, call.is_whole = self._images_of_call, self._is_whole
         while flags := native.camtorch_together(call):
             if flags & structs.LEFT_MOST:
-                return None
+                return {}
             of_labels = flags >> structs.LEFT_BITS  # if C came to the labels, all images are made
             if not of_labels:
                 follow(flags, target, source)
@@ -313,11 +320,48 @@ class SampleCall:
             call.job_count = 0
             follow(of_labels, source, target)
             if of_labels == structs.LEFT_LABELS:  # nothing else is missing
-                for i in self._may_be_refused:
-                    results[i] = None
+                for name in self._may_be_refused:
+                    results[name] = None
                 break
-        if not one_thread:
+        if not self._is_whole:
             for job in self._jobs:  # threads share each image by its tiles
                 job.next = 0
-                spread(functools.partial(native.camtorch_sample, job), min(threads, self._tiles))
+                spread(functools.partial(native.camtorch_sample, job), min(self._threads, self._tiles))
+        for name, narrower in self._narrowed.items():
+            pair = results[name]
+            if pair is not None:
+                results[name] = in_range(pair[0], narrower), pair[1]
         return results
+
+
+def pixels_together(
+    warp: Warp, values: Mapping[str, Tensor], hows: Mapping[str, How], batched: bool
+) -> dict[str, MovedField]:
+    """Move pixels and boxes by one evaluation of the cameras in torch, where each takes hundreds of operations.
+
+    Nothing if less than two fields can. values, hows, batched: see `call_for`.
+    """
+    dtype = warp.source.intrinsics.dtype
+    outlines: dict[str, Tensor] = {}  # name -> (B, *N, 2): pixels, or points along the edges of boxes
+    for name, how in hows.items():
+        rows = values[name] if batched else values[name].unsqueeze(0)
+        if rows.dtype == dtype and how == "pixels":
+            outlines[name] = rows
+        elif rows.dtype == dtype and how == "boxes" and known_true(in_order(rows)):
+            outlines[name] = along_edges(corners_of(rows), structs.EDGE_POINTS)
+    if len(outlines) < 2 or not warp.moves_by_cameras:  # others move points by more than their cameras
+        return {}
+    moved, mapped = warp.move(torch.cat([outline.flatten(1, -2) for outline in outlines.values()], 1))
+    counts = [outline.shape[1:-1].numel() for outline in outlines.values()]
+    results: dict[str, MovedField] = {}
+    for (name, outline), pixels, flags in zip(
+        outlines.items(), moved.split(counts, 1), mapped.split(counts, 1), strict=True
+    ):
+        pixels, valid = pixels.reshape(outline.shape), flags.reshape(outline.shape[:-1])
+        if hows[name] == "pixels":
+            valid = valid & warp.target.contains(pixels)
+        else:
+            boxes = values[name] if batched else values[name].unsqueeze(0)
+            pixels, valid = around(warp, corners_of(boxes), pixels, valid)
+        results[name] = (pixels, valid) if batched else (pixels.squeeze(0), valid.squeeze(0))
+    return results
