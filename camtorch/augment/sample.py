@@ -166,10 +166,14 @@ class SampleTransform(KeepsCamera, nn.Module):
         # Options of `Warp`, or of a `HalvingWarp`, which takes None as antialias too
         self.options: Any = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
         self.antialias = antialias
-        self.mask_fill: float = as_number(mask_fill, "mask_fill", self._name)
-        self.valid_mask: bool = as_flag(valid_mask, "valid_mask", self._name)
+        self.mask_fill = mask_fill
+        self.valid_mask = valid_mask
 
     def __setattr__(self, name: str, value: Any) -> None:
+        if name == "mask_fill":
+            value = as_number(value, name, self._name)
+        elif name == "valid_mask":
+            value = as_flag(value, name, self._name)
         state = self.__dict__
         if name[:1] != "_" and "_calls" in state and state.get(name, self) is not value:
             self._calls.revision = object()

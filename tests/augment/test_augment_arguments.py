@@ -266,10 +266,12 @@ def test_what_is_set_later_is_checked_as_by_the_constructor(camera):
         ("p", "half", "RandomMount: p must be a number"),
         ("min_filled", -3, r"RandomMount: min_filled must be a part in \[0, 1\]; got -3"),
         ("same_on_batch", 3, "RandomMount: same_on_batch must be"),
+        ("mask_fill", "none", "RandomMount: mask_fill must be a number; got 'none'"),
+        ("valid_mask", 3, "RandomMount: valid_mask must be True or False; got 3"),
     ):
         with pytest.raises((TypeError, ValueError), match=text):
             setattr(mount, name, value)
-    assert (mount.p, mount.min_filled) == (0.5, None)
+    assert (mount.p, mount.min_filled, mount.mask_fill, mount.valid_mask) == (0.5, None, 0, False)
     mount.p, mount.min_filled = 1, 0.5
     assert mount(keypoints=POINTS)["keypoints"].shape == POINTS.shape
 
