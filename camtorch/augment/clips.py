@@ -42,10 +42,10 @@ class Clips:
         if image is None:
             return None
         per_clip = ["camera", "rotation", PLACE]
-        for name in (name for name, kind in kinds.items() if kind == "K"):
-            if dims[name] == 4:  # of each frame
+        for name, kind in kinds.items():
+            if kind == "K" and dims[name] == 4:  # of each frame
                 check_alike(name, given[name], owner)
-            else:
+            elif kind == "K":
                 per_clip.append(name)
         found = {name for name, kind in kinds.items() if kind is not None and name not in per_clip}
         found |= {f"{name}_valid" for name in found} | {"image_valid", *tables}
@@ -66,7 +66,8 @@ class Clips:
             flat[name] = torch.as_tensor(value).flatten(0, 1)
         for name in self.per_clip:
             value = camera if name == "camera" else flat.get(name)
-            flat |= {} if value is None else {name: self.repeated(value, name)}
+            if value is not None:
+                flat[name] = self.repeated(value, name)
         return flat
 
     def first_frames(self, frames: Mapping[str, Any], fields: Mapping[str, str]) -> Named:

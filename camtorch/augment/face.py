@@ -158,7 +158,8 @@ class FaceNormalizer(SampleTransform):
 
     def _head(self, values: Mapping[str, Any]) -> tuple[Tensor, Tensor] | None:
         """Return the head's rotation (B, 3, 3) and the face's centre (B, 3) of values by name; None without a pose."""
-        if listed := [n for n in ("head_pose", "rvec", "tvec", "face_center") if isinstance(values.get(n), list)]:
+        listed = [n for n in ("head_pose", "rvec", "tvec", "face_center") if isinstance(values.get(n), list)]
+        if listed:
             raise TypeError(f"{self._name}: {', '.join(listed)} must be one tensor for all samples; got a list")
         if "head_pose" in values:
             pose = values["head_pose"]
@@ -175,7 +176,8 @@ class FaceNormalizer(SampleTransform):
         augmentations), and any other fields: gaze, keypoints, 3D points, images.
         """
         sample = self._given(sample, fields)
-        if missing := [name for name in ("camera", "rotation", "source_camera") if sample.get(name) is None]:
+        missing = [name for name in ("camera", "rotation", "source_camera") if sample.get(name) is None]
+        if missing:
             raise ValueError(f"{self._name}: a sample to move back must have {', '.join(missing)}; got none")
         normal, source, rotation = (sample.pop(name) for name in ("camera", "source_camera", "rotation"))
         batch = self._batch(sample, normal, predicted=True)

@@ -115,7 +115,7 @@ def as_table(value: TableLike, owner: str) -> Table:
 _FACES = {n: " or ".join(repr(k) for k, v in LANDMARKS.items() if len(v) == n) for n in (68, 98, 106, 468, 478)}
 _SURELY_LANDMARKS = "keypoints", "landmarks"  # kinds of fields
 _MAYBE_LANDMARKS = *_SURELY_LANDMARKS, "points"
-_LEFT, _RIGHT = "_left", "_right"
+_OTHER_SIDE = {"left": "right", "right": "left"}
 
 
 class Mirroring:
@@ -194,18 +194,22 @@ class Mirroring:
 
     def sides(self, names: Iterable[str]) -> list[tuple[str, str]]:
         """Return the pairs of fields that change places."""
-        found = []
+        found: list[tuple[str, str]] = []
+        if not self.swap_sides:
+            return found
         names = set(names)
-        for name in sorted(names) if self.swap_sides else ():
-            for mine, its in ((_LEFT, _RIGHT), (_RIGHT, _LEFT)):
-                if name.endswith(mine):
-                    other = name.removesuffix(mine) + its
-                    if other not in names:
-                        raise ValueError(
-                            f"{self.owner}: {name} must have a {other}, with which it changes places in a mirror; got "
-                            "none. swap_sides=False keeps the name"
-                        )
-                    found += [(name, other)] if mine == _LEFT else []
+        for name in sorted(names):
+            beginning, mark, side = name.rpartition("_")
+            if not mark or side not in _OTHER_SIDE:
+                continue
+            other = f"{beginning}_{_OTHER_SIDE[side]}"
+            if other not in names:
+                raise ValueError(
+                    f"{self.owner}: {name} must have a {other}, with which it changes places in a mirror; got none. "
+                    "swap_sides=False keeps the name"
+                )
+            if side == "left":
+                found.append((name, other))
         return found
 
     def exchange(self, moved: dict[str, Any], named: Named, mirrored: Tensor | None, batched: bool, owner: str) -> None:
@@ -215,8 +219,10 @@ class Mirroring:
         """
         sides = self.sides(named)  # raises if a side lacks the other one, whether or not this draw mirrors
         kinds: dict[str, str | None] = {name: kind for name, (kind, _) in named.items()}
-        for name in [name for name in moved if name.rpartition("/")[2] in self.by_name and name not in named]:
-            kinds[name], moved[name] = None, _as_tensors(moved[name], name, owner)
+        for name in moved:
+            if name.rpartition("/")[2] in self.by_name and name not in named:
+                kinds[name] = None
+                moved[name] = _as_tensors(moved[name], name, owner)
         pixels = [one for kind, value in named.values() if kind in _SURELY_LANDMARKS for one in _batches(value)]
         faces = {tuple(one.shape[1:3]) for one in pixels if one.ndim == 4}  # (F, N)
         # key -> its field, and whether each landmark has a flag, or one number, instead of a dim of coordinates
@@ -230,9 +236,11 @@ class Mirroring:
         for key, (name, flags) in keys.items():
             value = moved[key]
             rows = torch.zeros(len(value), dtype=torch.bool) if mirrored is None else mirrored
-            each = zip(_batches(value), rows.split(1) if isinstance(value, list) else [rows], strict=False)
-            swapped = [self.swapped(name, kinds[name], batch, row, flags, faces) for batch, row in each]
-            moved[key] = [batch[0] for batch in swapped] if isinstance(value, list) else swapped[0]
+            if isinstance(value, list):
+                each = zip(_batches(value), rows.split(1), strict=False)
+                moved[key] = [self.swapped(name, kinds[name], one, row, flags, faces)[0] for one, row in each]
+            else:
+                moved[key] = self.swapped(name, kinds[name], value, rows, flags, faces)
         for left, right in sides:
             for one, other in ((left, right), (f"{left}_valid", f"{right}_valid")):
                 if mirrored is not None and one in keys and other in keys:

@@ -128,8 +128,12 @@ def is_text(value: Any) -> bool:
 def _close_to(name: str) -> list[str]:
     """Return the kind that a name may mean: of the whole, or of its last word, as in `face_bbox` and `left_eye`."""
     last = name.rpartition("_")[2].removesuffix("s")
-    if name.startswith("seg") or "box" in last or last in _WORDS_OF_KINDS:
-        return ["mask" if name.startswith("seg") else "boxes" if "box" in last else _WORDS_OF_KINDS[last]]
+    if name.startswith("seg"):
+        return ["mask"]
+    if "box" in last:
+        return ["boxes"]
+    if last in _WORDS_OF_KINDS:
+        return [_WORDS_OF_KINDS[last]]
     return difflib.get_close_matches(name, KINDS, 1) or difflib.get_close_matches(last, KINDS, 1)
 
 
@@ -153,9 +157,13 @@ def _may_be_geometry(name: str, value: Any, single: bool, above: int = 0) -> boo
         whole, known = not (value.is_floating_point() or value.is_complex()), True
     else:
         whole, known = not isinstance(value, float), isinstance(value, (int, float))
-    dims, row = above + getattr(value, "ndim", 0), 1 if single else 2
-    known_as = (dims == row and _close_to(name)) or (not whole and _is_angle(name))
-    return known and (dims > (row if whole else 0) or bool(known_as))
+    if not known:
+        return False
+    dims = above + getattr(value, "ndim", 0)
+    if not whole:
+        return dims > 0 or _is_angle(name)
+    row = 1 if single else 2
+    return dims > row or (dims == row and len(_close_to(name)) > 0)
 
 
 def _is_angle(name: str) -> bool:

@@ -94,7 +94,9 @@ def check_cameras(camera: object, count: int, named: Named, owner: str) -> None:
             raise ValueError(f"{owner}: {name} must have no batch dims, or those of {count} samples; got {shape}{hint}")
         for field, value in images:
             shapes = [v.shape for v in value] if isinstance(value, list) else [value.shape]
-            for of_image in shapes[i : i + 1] if several and isinstance(value, list) else shapes:
+            if several and isinstance(value, list):
+                shapes = shapes[i : i + 1]
+            for of_image in shapes:
                 _check_size(field, tuple(of_image), name, one.image_size, owner)
     check_one_size("camera", {one.image_size for one in cameras}, owner)
 

@@ -63,9 +63,11 @@ class KeepsCamera:
             value = copy.deepcopy(value)
             for tensor in (*value.parameters(), *value.buffers()):
                 tensor.requires_grad_(False)
-            for part in value.modules():  # as buffers, which network.requires_grad_(True) leaves alone
-                learns = [key for key, tensor in part._parameters.items() if tensor is not None]
-                for key in learns if isinstance(part, GeometryModule) else ():
+            for part in value.modules():
+                if not isinstance(part, GeometryModule):
+                    continue
+                # as buffers, which network.requires_grad_(True) leaves alone
+                for key in [key for key, tensor in part._parameters.items() if tensor is not None]:
                     part.put(key, cast("Tensor", part._parameters.pop(key)).detach(), persistent=True)
         super().__setattr__(name, value)
 
@@ -368,7 +370,8 @@ class SampleTransform(KeepsCamera, nn.Module):
 def still_valid(name: str, valid: Any, given: Any, owner: str) -> Any:
     """Return the flags that come out, invalid if those given are; any number but zero is valid, as in COCO."""
     many = isinstance(valid, list)
-    now, before = valid if many else [valid], [torch.as_tensor(b) != 0 for b in (given if many else [given])]
+    now = valid if many else [valid]
+    before = [torch.as_tensor(b) != 0 for b in (given if many else [given])]
     if [b.shape for b in before] != [v.shape for v in now]:
         shapes = ", ".join(str(tuple(v.shape)) for v in now)
         raise ValueError(f"{owner}: {name} must be {shapes}; got {[tuple(b.shape) for b in before]}")

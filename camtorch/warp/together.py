@@ -115,11 +115,6 @@ def _surely_keeps_size(back: NativeMove, sizes: Sizes) -> bool:
     return bool((total < SURELY * SHRINKS * step * np.maximum(count, 1)).all())
 
 
-def _is_averaged(value: Tensor, how: How) -> bool:
-    """Whether a value is an image whose pixels are averaged."""
-    return isinstance(how, Sampler) and how.mode != "nearest" and value.dtype != torch.bool
-
-
 def _as_images(value: Tensor, batched: bool) -> Tensor:
     """Return an image or a mask as (B, C, H, W)."""
     value = value if batched else value.unsqueeze(0)
@@ -171,9 +166,9 @@ class SampleCall:
         self._copied = [name for name in pixels if values[name].dtype != dtype or not values[name].is_contiguous()]
         self._narrowed = {name: values[name].dtype for name in pixels if values[name].dtype != dtype}
         self._may_be_refused = [name for name, how in hows.items() if how in ("boxes", "pose", "rotation vectors")]
-        # whether each run asks if images shrink: these are halved elsewhere
-        averaged = [name for name, how in samplers.items() if _is_averaged(values[name], how)]
-        self._may_halve = options["antialias"] is None and len(averaged) > 0
+        # whether each run asks if images whose pixels are averaged shrink: these are halved elsewhere
+        averaged = (how.mode != "nearest" and values[name].dtype != torch.bool for name, how in samplers.items())
+        self._may_halve = options["antialias"] is None and any(averaged)
         self._images_of_call = len(samplers) if self._count == 1 else 0  # those of a batch are made with their lattices
         self._tiles = tiles_of(sizes[1])  # of an image, which threads share
         # whether one thread makes images and labels
@@ -353,15 +348,14 @@ def pixels_together(
         return {}
     moved, mapped = warp.move(torch.cat([outline.flatten(1, -2) for outline in outlines.values()], 1))
     counts = [outline.shape[1:-1].numel() for outline in outlines.values()]
+    of_fields = zip(outlines.items(), moved.split(counts, 1), mapped.split(counts, 1), strict=True)
     results: dict[str, MovedField] = {}
-    for (name, outline), pixels, flags in zip(
-        outlines.items(), moved.split(counts, 1), mapped.split(counts, 1), strict=True
-    ):
-        pixels, valid = pixels.reshape(outline.shape), flags.reshape(outline.shape[:-1])
+    for (name, outline), places, seen in of_fields:
+        rows, valid = places.reshape(outline.shape), seen.reshape(outline.shape[:-1])
         if hows[name] == "pixels":
-            valid = valid & warp.target.contains(pixels)
+            valid = valid & warp.target.contains(rows)
         else:
             boxes = values[name] if batched else values[name].unsqueeze(0)
-            pixels, valid = around(warp, corners_of(boxes), pixels, valid)
-        results[name] = (pixels, valid) if batched else (pixels.squeeze(0), valid.squeeze(0))
+            rows, valid = around(warp, corners_of(boxes), rows, valid)
+        results[name] = (rows, valid) if batched else (rows.squeeze(0), valid.squeeze(0))
     return results
