@@ -119,14 +119,20 @@ FRONT_ENDS = {
 }
 
 
-def both(front_end, augment, lens, fields, monkeypatch):
-    """What comes of the fields by a front end, and by the native call with the same draw."""
+def both(front_end, augment, lens, fields, monkeypatch, native=None):
+    """What comes of the fields by a front end, and of them or `native` by the native call with the same draw."""
     move, kind = FRONT_ENDS[front_end]
     torch.manual_seed(3)
     with torchvision_of(kind, monkeypatch) if kind else contextlib.nullcontext() as tv_tensors:
         moved, draw = move(augment, lens, fields, tv_tensors)
     torch.manual_seed(3)
-    return moved, augment(fields if lens is None else {**fields, "camera": lens}, **draw)
+    return moved, augment(native or (fields if lens is None else {**fields, "camera": lens}), **draw)
+
+
+def assert_same(front_end, moved, want, names):
+    for name in names:
+        tolerance = 1e-5 if (front_end, name) == ("albumentations", "keypoints") else 0
+        torch.testing.assert_close(moved[name], want[name], rtol=0, atol=tolerance, msg=f"{name}: {{}}".format)
 
 
 CASES = [
@@ -149,9 +155,7 @@ def test_all_fields_move_as_by_the_native_call(front_end, name, batch, monkeypat
     fields = sample(*batch)
     assert fields.keys() == KINDS.keys() - {"K"}  # which this lens has none of
     moved, want = both(front_end, augment, lens, fields, monkeypatch)
-    for key in fields.keys() | {n for n in want if n.endswith("_valid") and n in moved}:
-        tolerance = 1e-5 if (front_end, key) == ("albumentations", "keypoints") else 0
-        torch.testing.assert_close(moved[key], want[key], rtol=0, atol=tolerance, msg=f"{key}: {{}}".format)
+    assert_same(front_end, moved, want, fields.keys() | {n for n in want if n.endswith("_valid") and n in moved})
 
 
 @pytest.mark.filterwarnings("ignore:.*will show nothing")
@@ -166,18 +170,12 @@ def test_a_matrix_or_a_number_stands_for_the_camera(front_end, key, name, monkey
         pytest.skip("kornia wants boxes by `with_boxes`")
     fields = sample(2) if kornia else sample()
     matrix = torch.tensor([[65.0, 0, 30], [0, 66, 24], [0, 0, 1]]).expand(*fields["pose"].shape[:-2], 3, 3)
-    fields |= {key: matrix} if key else {}
-    move, kind = FRONT_ENDS[front_end]
-    augment = AUGMENTATIONS[name]()
-    torch.manual_seed(3)
-    with torchvision_of(kind, monkeypatch) if kind else contextlib.nullcontext() as tv_tensors:
-        moved, draw = move(augment, 50 if kornia or not key else None, fields, tv_tensors)
-    torch.manual_seed(3)
     known = ct.Pinhole.from_matrix(matrix, image_size=SIZE) if key else ct.Pinhole.from_fov(50, image_size=SIZE)
-    want = augment({n: v for n, v in fields.items() if n != key}, camera=known.requires_grad_(False), **draw)
-    for field in fields.keys() - {key}:
-        tolerance = 1e-5 if (front_end, field) == ("albumentations", "keypoints") else 0
-        torch.testing.assert_close(moved[field], want[field], rtol=0, atol=tolerance, msg=f"{field}: {{}}".format)
+    native = {**fields, "camera": known.requires_grad_(False)}
+    fields |= {key: matrix} if key else {}
+    number = 50 if kornia or not key else None
+    moved, want = both(front_end, AUGMENTATIONS[name](), number, fields, monkeypatch, native)
+    assert_same(front_end, moved, want, native.keys() - {"camera"})
     if key:
         new = want["camera"].intrinsics
         assert torch.equal(moved[key][..., (0, 1, 0, 1), (0, 1, 2, 2)], new.expand(*matrix.shape[:-2], 4))
