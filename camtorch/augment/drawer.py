@@ -13,7 +13,7 @@ from camtorch.augment.augmentation import Augmentation, AugmentationOptions
 from camtorch.augment.devices import twin_of
 from camtorch.augment.filling import enough, scaled
 from camtorch.augment.jitter import jittered
-from camtorch.augment.native_draws import DRAWN_KINDS, Start, Wanted, too_wide
+from camtorch.augment.native_draws import DRAWN_SIZES, Start, Wanted, too_wide
 from camtorch.augment.part import LazyWarp, Part
 from camtorch.augment.presets import REAL, as_like
 from camtorch.augment.ranges import TURN, Draw, Range, RangeLike, as_range, as_tensors, values_for
@@ -40,10 +40,10 @@ _LIMITS: dict[str, dict[str, Any]] = {
     "lens": {},
     "fov": {"least": _TINY, "most": 360, "is_pair": True},
     "focal": {"least": _TINY, "most": _HUGE, "around": 1},
-    "centre": {"least": -1, "most": 1, "size": DRAWN_KINDS["centre"][1]},
-    "distortion": {"least": -1, "most": 1, "size": DRAWN_KINDS["distortion"][1]},
+    "centre": {"least": -1, "most": 1, "size": DRAWN_SIZES["centre"]},
+    "distortion": {"least": -1, "most": 1, "size": DRAWN_SIZES["distortion"]},
     "crop": {"least": _TINY, "most": 1, "is_pair": True},
-    "place": {"size": DRAWN_KINDS["place"][1]},
+    "place": {"size": DRAWN_SIZES["place"]},
     "chromatic": {"least": -0.5, "most": 0.5, "size": 2},
     "vignetting": {"least": 0, "most": 1},
     "cos4": {"least": -2, "most": 2},

@@ -128,11 +128,9 @@ def _domain(library: Library, n: Numbers) -> Answer:
 
 
 def _draws(library: Library, n: Numbers) -> Answer:
-    zoom = _numbers(100)
-    draws = structs.Draws(cameras=1, height=8, width=8, sized=at(n.intrinsics), base=at(n.camera), made=n.camera)
-    draws.room = draws.factors = draws.filled = n.out
-    draws.first[:], draws.values = [-1] * structs.DRAWN_KINDS, at(zoom)
-    draws.first[structs.ZOOM] = 0
+    start = structs.Start(height=8, width=8, sized=at(n.intrinsics), base=at(n.camera))
+    drawn = structs.Drawn(zoom=100, focal=1, crop=1)
+    draws = structs.Draws(start=at(start), drawn=at(drawn), cameras=1, room=n.out, factors=n.out, filled=n.out)
     most = library.camtorch_draws(draws)
     return (most, *n.made[:4]), (0, 200, 200, 1, 1)
 

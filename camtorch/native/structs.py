@@ -6,7 +6,7 @@ from typing import Annotated
 
 from camtorch.native.structure import Double, Int32, Int64, Numbers, Pointer, Struct, Text, TypedLibrary, Unsigned, Void
 
-CHECKSUM = 2330108966
+CHECKSUM = 245809308
 
 CELL_MISSED = 0.0703125
 CELL_MARGIN = 0.05
@@ -54,11 +54,10 @@ LEFT_FROM, LEFT_TO, LEFT_MOST, LEFT_LABELS = 1, 2, 4, 8
 SQUARES = 64
 LEFT_BITS = 4
 RAYS, POSE, ROTATION_VECTORS = range(3)
-YAW, PITCH, ROLL, ZOOM, WIDTH, FOCAL, CENTRE, DISTORTION, CROP, PLACE, DRAWN_KINDS = range(11)
 AMOUNTS = 16
 TRIES = 8
 RIM = 128
-LEFT_BASE, LEFT_LENS, LEFT_ENDS, TOO_WIDE, NO_CAMERA, LEFT_SOURCE = 1, 2, 4, 8, 16, 32
+LEFT_BASE, LEFT_SOURCE, LEFT_ENDS, TOO_WIDE, NO_CAMERA = 1, 2, 4, 8, 16
 SPREAD, LOOKED_AT = 1000, 1064
 HALVINGS = 10
 FROM_RAYS, REFINED, SOLVED, AGREED = range(4)
@@ -300,14 +299,25 @@ class Together(Struct):
     lattices: Lattices
 
 
-class Draws(Struct):
+class Drawn(Struct):
     __slots__ = ()
-    values: Pointer
-    first: Annotated[Numbers, c_int64 * 10]
-    cameras: Int64
-    count: Int64
+    yaw: Double
+    pitch: Double
+    roll: Double
+    zoom: Double
+    fov: Double
+    focal: Double
+    centre: Annotated[Numbers, c_double * 2]
+    distortion: Annotated[Numbers, c_double * 16]
+    crop: Double
+    place: Annotated[Numbers, c_double * 2]
+
+
+class Start(Struct):
+    __slots__ = ()
     height: Double
     width: Double
+    count: Int64
     is_each: Int64
     sized: Pointer
     reach: Pointer
@@ -315,20 +325,25 @@ class Draws(Struct):
     sensitivity: Pointer
     ends: Pointer
     base: Pointer
-    border: Pointer
     places: Pointer
+    border: Pointer
     domain: Domain
-    tries: Pointer
-    tried: Pointer
-    allowed: Pointer
     share: Double
     source: Pointer
     source_height: Double
     source_width: Double
     looked_at: Pointer
+
+
+class Draws(Struct):
+    __slots__ = ()
+    start: Pointer
+    drawn: Pointer
+    cameras: Int64
+    room: Pointer
+    limits: Pointer
     factors: Pointer
     filled: Pointer
-    room: Pointer
     made: Cameras
     rotations: Pointer
     distortion: Pointer
@@ -405,7 +420,7 @@ class Steps(Struct):
     left: Pointer
 
 
-STRUCTS = Agreement, Job, Images, Classification, Laying, Part, Cameras, Domain, Rows, Move, Lattices, Turned, Together, Draws, Poses, Views, Steps
+STRUCTS = Agreement, Job, Images, Classification, Laying, Part, Cameras, Domain, Rows, Move, Lattices, Turned, Together, Drawn, Start, Draws, Poses, Views, Steps
 for struct in STRUCTS:
     struct.lay_out()
 
