@@ -84,6 +84,13 @@ class _Task(NamedTuple):
     build: Callable[[Tensor], CameraLike]
     tolerance: float
 
+    def of(self, rows: Tensor) -> _Task:
+        """Return the task of converting some of the cameras."""
+        camera, image_size, lattice, *_ = self.source
+        intrinsics, distortion = (t[rows] for t in camera.tensors)
+        chosen = remade(camera, intrinsics=intrinsics, distortion=distortion)
+        return self._replace(source=reference(chosen, image_size, lattice.limit))
+
 
 class _Result(NamedTuple):
     """Parameters (C, 4 + n), and the numbers of a `Conversion`, (C,) each."""
@@ -95,13 +102,16 @@ class _Result(NamedTuple):
     valid_fraction: Tensor
     exact: Tensor
 
-    def replaced(self, which: Tensor, other: _Result) -> _Result:
-        """Return the results with those of `other` where `which`, bool (C,), is true."""
-        if not bool(which.any()):
+    def of(self, rows: Tensor) -> _Result:
+        return _Result(*(t[rows] for t in self))
+
+    def replaced(self, rows: Tensor, other: _Result) -> _Result:
+        """Return the results with those of `other` at `rows`."""
+        if len(rows) == 0:
             return self  # without padding
         width = max(self.parameters.shape[-1], other.parameters.shape[-1])
-        parameters, *numbers = zip(other.padded(width), self.padded(width), strict=True)
-        return _Result(torch.where(which[:, None], *parameters), *(torch.where(which, *pair) for pair in numbers))
+        pairs = zip(self.padded(width), other.padded(width), strict=True)
+        return _Result(*(t.index_copy(0, rows, new) for t, new in pairs))
 
     def padded(self, width: int) -> _Result:
         """Return the results with parameters (C, width), filled with zeros."""
@@ -113,13 +123,13 @@ def _with_fewest_coefficients(task: _Task, counts: tuple[int, ...]) -> _Result:
     """Convert each row with the first of `counts` within the tolerance, or with the last one that halved the error."""
     result = _convert(task, counts[0])
     for count in counts[1:]:
-        wanting = (result.max_error > task.tolerance) & result.max_error.isfinite()
-        if not bool(wanting.any()):
+        rows = ((result.max_error > task.tolerance) & result.max_error.isfinite()).nonzero()[:, 0]
+        if len(rows) == 0:
             break
-        other = _convert(task, count)
-        enough = (_WORTH_IT * result.max_error).clamp(min=task.tolerance)
-        good = wanting & (other.max_error <= enough) & _reaches_as_far(other, result)
-        result = result.replaced(good, other)
+        before, other = result.of(rows), _convert(task.of(rows), count)
+        most = (_WORTH_IT * before.max_error).clamp(min=task.tolerance)
+        good = (other.max_error <= most) & _reaches_as_far(other, before)
+        result = result.replaced(rows[good], other.of(good))
     return result
 
 
@@ -147,13 +157,14 @@ def _convert(task: _Task, count: int) -> _Result:
         parameters = torch.where(exact[:, None], parameters, fitted)
     result = _measure(task, parameters, exact)
     # the largest error of any camera of the model is at least the least rms
-    wanting = (result.max_error > task.tolerance) & (result.rms < task.tolerance)
-    if bool(wanting.any()):
-        observations = views.with_rings(samples, source, task.source.image_size)
-        refined = refine_minimax(build(parameters), observations, parameters, wanting)
-        minimax = _measure(task, refined, exact)
-        better = wanting & (minimax.max_error < result.max_error) & _reaches_as_far(minimax, result)
-        result = result.replaced(better, minimax)
+    rows = ((result.max_error > task.tolerance) & (result.rms < task.tolerance)).nonzero()[:, 0]
+    if len(rows):
+        before, task = result.of(rows), task.of(rows)
+        observations = views.with_rings(samples.of(rows), task.source.camera, task.source.image_size)
+        refined = refine_minimax(build(before.parameters), observations, before.parameters)
+        minimax = _measure(task, refined, before.exact)
+        better = (minimax.max_error < before.max_error) & _reaches_as_far(minimax, before)
+        result = result.replaced(rows[better], minimax.of(better))
     return result
 
 

@@ -104,8 +104,8 @@ def _fit_linear(
     return parameters
 
 
-def refine_minimax(camera: CameraLike, observations: RayPixels, parameters: Tensor, wanting: Tensor) -> Tensor:
-    """Return parameters (C, 4 + n) near the given ones with a smaller largest error, for rows (C,) that are `wanting`.
+def refine_minimax(camera: CameraLike, observations: RayPixels, parameters: Tensor) -> Tensor:
+    """Return parameters (C, 4 + n) near the given ones with a smaller largest error; no row depends on another.
 
     Lawson's algorithm: repeated weighted least squares; each time the weight of a square is multiplied by its error.
     """
@@ -116,7 +116,7 @@ def refine_minimax(camera: CameraLike, observations: RayPixels, parameters: Tens
     observations = observations._replace(weights=covered)
     best, weights = parameters, covered
     error = _distances(observations, camera, parameters)
-    least, stale = error.amax(-1), torch.where(wanting, 0.0, float(_PATIENCE))
+    least, stale = error.amax(-1), torch.zeros_like(error[:, 0])
     for _ in range(_LAWSON_ROUNDS):
         going = stale < _PATIENCE
         if not bool(going.any()):
