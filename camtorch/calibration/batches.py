@@ -18,8 +18,8 @@ def as_stacked(values: Numbers, name: str, owner: str, device: torch.device) -> 
     return as_values(values, name, owner, device)
 
 
-def as_vectors(values: Numbers, name: str, size: int, owner: str, device: torch.device) -> Tensor:
-    """Return vectors (*B, N, size) from such values, or from OpenCV's (*B, N, 1, size)."""
+def as_point_sets(values: Numbers, name: str, size: int, owner: str, device: torch.device) -> Tensor:
+    """Return points (*B, N, size) from such values, or from OpenCV's (*B, N, 1, size)."""
     vectors = as_stacked(values, name, owner, device)
     if vectors.ndim > 2 and vectors.shape[-2] == 1 and vectors.shape[-3] > 1:
         vectors = vectors.squeeze(-2)

@@ -288,8 +288,10 @@ class Bundle:
         return turned, first, first @ mounts.rotations[:, c, None].mT + mounts.translations[:, c, None, None]
 
     def camera(self, c: int, state: State) -> Camera:
-        parameters = state.parameters[c]
-        return self.fixed[c] or remade(self.cameras[c], intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
+        fixed, parameters = self.fixed[c], state.parameters[c]
+        if fixed is not None:
+            return fixed
+        return remade(self.cameras[c], intrinsics=parameters[:, :4], distortion=parameters[:, 4:])
 
     def errors_of(self, c: int, flat: Sequence[Tensor], rows: Tensor) -> Errors:
         """Return residuals, validity, weights and costs of a camera at a state."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from camtorch.calibration.batches import as_double_rows, as_stacked, as_vectors, attached, learns, root_of
+from camtorch.calibration.batches import as_double_rows, as_point_sets, as_stacked, attached, learns, root_of
 from camtorch.calibration.bundle import CameraObservations, Poses, adjust_poses
 from camtorch.calibration.native_calls import PoseSearch, Solved, solve_poses
 from camtorch.calibration.ransac import LEAST, consensus
@@ -155,8 +155,8 @@ class _Given(NamedTuple):
         if camera.is_mixed:
             raise TypeError(f"{owner}: camera must be of one model; got a Mixed. Call it for each member, camera[i]")
         device = camera.intrinsics.device
-        points = as_vectors(object_points, "object_points", 3, owner, device)
-        seen_at = as_vectors(pixels, "pixels", 2, owner, device)
+        points = as_point_sets(object_points, "object_points", 3, owner, device)
+        seen_at = as_point_sets(pixels, "pixels", 2, owner, device)
         count = seen_at.shape[-2]
         given = None if weights is None else as_stacked(weights, "weights", owner, device)
         shapes = f"object_points {tuple(points.shape)} and pixels {tuple(seen_at.shape)}"
