@@ -44,8 +44,11 @@ def locate(cameras: CameraPair, rows: range, tolerance: float, padding: str, ant
 
 
 def _located(cameras: CameraPair, rows: range, tolerance: float, padding: str) -> Positions:
-    lattice = on_lattice(cameras, rows, tolerance, padding) if tolerance else None
-    return lattice or PixelPositions(*_row_by_row(cameras, rows), None)
+    if tolerance:
+        lattice = on_lattice(cameras, rows, tolerance, padding)
+        if lattice is not None:
+            return lattice
+    return PixelPositions(*_row_by_row(cameras, rows), None)
 
 
 def scaled_rows(

@@ -155,10 +155,10 @@ class RoutedWarp(GeometryModule):
         return [name for name in names if name not in inside]
 
     @classmethod
-    def of_valid(cls, *given: Any) -> Self:
-        """Return a warp, without a rotation yet, from valid arguments of `set_up`."""
+    def of_valid(cls, source: Camera, target: Camera, options: Options) -> Self:
+        """Return a warp, without a rotation yet, of valid cameras and options."""
         warp = cls.__new__(cls)
-        warp.set_up(*given)
+        warp.set_up(source, target, options)
         return warp
 
     def turned_by(self, rotation: Tensor | None) -> Self:

@@ -30,6 +30,7 @@ from camtorch.values.dtypes import check_averaged, narrow, widen
 from camtorch.values.module import typed_as
 from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.boxes import enclosed, moved_boxes
+from camtorch.warp.lattice import PixelPositions
 from camtorch.warp.options import MODES, PADDINGS, Fill, Mode, Options, PaddingMode, Sampler, as_fill, as_options
 from camtorch.warp.routes import KeptPositions, RoutedWarp
 
@@ -234,7 +235,7 @@ class Warp(RoutedWarp):
         every = range(self.target.size_for("Warp")[0])
         where = self.locate(every, self.padding_mode, 0.0) if learns else self.positions("kept")
         # a lattice serves one padding, and so do positions that were made of one on the CPU
-        is_exact = learns or (where.pixels is where and self.host is None)
+        is_exact = learns or (isinstance(where, PixelPositions) and self.host is None)
         self._kept.renew(lambda: KeptPositions(where, PADDINGS if is_exact else [self.padding_mode]))
         return self
 
