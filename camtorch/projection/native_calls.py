@@ -83,10 +83,7 @@ def project_jacobians(native: Native, points: Tensor, by_camera: bool) -> tuple[
         call.rows, call.row_strides[:], call.direction = points.data_ptr(), points.stride(), structs.PROJECT_VJP
         call.results, call.result_strides[:] = by.data_ptr(), by.stride()
         call.cotangents, call.cotangent_strides[:] = one.data_ptr(), (0, 0, 1)
-        call.sums = to.data_ptr() if by_camera else None
-        while _call(native, cameras, count, call, tile):
-            native.follow()
-            to.zero_()
+        _differentiate(native, cameras, count, call, to if by_camera else None, tile)
     return by_points.movedim(0, 2), sums.movedim(0, 2)
 
 
@@ -114,9 +111,19 @@ def _vjp(
         call.results, call.result_strides[:] = results.data_ptr(), results.stride()
     component, *row = cotangents.stride()
     call.cotangents, call.cotangent_strides[:] = cotangents.data_ptr(), (*row, component)
-    call.sums = None if sums is None else sums.data_ptr()
-    _call(native, cameras, count, call)  # no point waits: the call whose derivatives these are has followed azimuths
+    _differentiate(native, cameras, count, call, sums)
     return results, None if sums is None else sums.sum(1).to(native.dtype)
+
+
+def _differentiate(
+    native: Native, cameras: int, count: int, call: structs.Rows, sums: Tensor | None, tile: int = TILE_POINTS
+) -> None:
+    """Call the native geometry, which adds a row to zeros, `sums`, for each tile of each camera."""
+    call.sums = None if sums is None else sums.data_ptr()
+    while _call(native, cameras, count, call, tile):
+        native.follow()
+        if sums is not None:
+            sums.zero_()
 
 
 def _empty(size: tuple[int, int, int], dtype: torch.dtype) -> Tensor:
