@@ -154,15 +154,30 @@ class SampleCall:
         """Take the arguments of `call_for`."""
         self._sizes, self._dtype, self._batched = sizes, dtype, batched
         self._count, self._threads = _count_of(values, batched), thread_count()
-        self._call = structs.Together()
+        call = self._call = structs.Together()
         samplers = {name: how for name, how in hows.items() if isinstance(how, Sampler)}
-        pixels = {name: how for name, how in hows.items() if how in ("pixels", "boxes")}
-        vectors = {name: how for name, how in hows.items() if name not in samplers and name not in pixels}
+        pixels = [name for name, how in hows.items() if how in ("pixels", "boxes")]
         self._lattices = self._lattices_of(samplers.values(), float(options["tolerance"] or 0))
-        self._back = self._call.lattices.move  # from the target to the source, which images are sampled by
-        readers = self._read_images(samplers, values) | self._read_pixels(pixels, values)
-        readers |= self._read_vectors(vectors, values)
-        self._readers = {name: readers[name] for name in hows}
+        self._back = call.lattices.move  # from the target to the source, which images are sampled by
+        jobs = self._jobs = (structs.Job * len(samplers))()
+        moves = (structs.Move * len(pixels))()
+        turns = (structs.Turned * (len(hows) - len(samplers) - len(pixels)))()
+        call.jobs, call.job_count = call.keep(jobs), len(jobs)
+        call.moves, call.move_count = call.keep(moves), len(moves)
+        call.turned, call.turned_count = call.keep(turns), len(turns)
+        if self._count > 1:  # C samples images as soon as their lattice is made
+            call.lattices.jobs, call.lattices.job_count = call.jobs, call.job_count
+        else:
+            self._back.next = None  # one thread makes the lattice, and needs no counter of those made
+        images, labels, vectors = iter(jobs), iter(moves), iter(turns)
+        self._readers: dict[str, Reader] = {}
+        for name, how in hows.items():
+            if isinstance(how, Sampler):
+                self._readers[name] = self._image_reader(next(images), values[name], how)
+            elif name in pixels:
+                self._readers[name] = self._pixel_reader(next(labels), values[name], how)
+            else:
+                self._readers[name] = self._vector_reader(next(vectors), values[name], how)
         self._copied = [name for name in pixels if values[name].dtype != dtype or not values[name].is_contiguous()]
         self._narrowed = {name: values[name].dtype for name in pixels if values[name].dtype != dtype}
         self._may_be_refused = [name for name, how in hows.items() if how in ("boxes", "pose", "rotation vectors")]
@@ -185,18 +200,6 @@ class SampleCall:
         self._call.lattices = made.struct
         return made
 
-    def _read_images(self, samplers: Mapping[str, Sampler], values: Mapping[str, Tensor]) -> dict[str, Reader]:
-        """Give C the images and masks, and return their readers by name."""
-        call = self._call
-        jobs = self._jobs = (structs.Job * len(samplers))()
-        call.jobs, call.job_count = call.keep(jobs), len(jobs)
-        if self._count > 1:  # C samples images as soon as their lattice is made
-            call.lattices.jobs, call.lattices.job_count = call.jobs, call.job_count
-        else:
-            self._back.next = None  # one thread makes the lattice, and needs no counter of those made
-        pairs = zip(samplers.items(), jobs, strict=True)
-        return {name: self._image_reader(job, values[name], how) for (name, how), job in pairs}
-
     def _image_reader(self, job: structs.Job, like: Tensor, how: Sampler) -> Reader:
         """Write into a job what all runs share; return what writes the rest in each run."""
         image = _as_images(like, self._batched)
@@ -212,14 +215,6 @@ class SampleCall:
             return result, None
 
         return read
-
-    def _read_pixels(self, hows: Mapping[str, How], values: Mapping[str, Tensor]) -> dict[str, Reader]:
-        """Give C the pixels and boxes, and return their readers by name."""
-        call = self._call
-        moves = (structs.Move * len(hows))()
-        call.moves, call.move_count = call.keep(moves), len(moves)
-        pairs = zip(hows.items(), moves, strict=True)
-        return {name: self._pixel_reader(move, values[name], how) for (name, how), move in pairs}
 
     def _pixel_reader(self, move: structs.Move, like: Tensor, how: How) -> Reader:
         """Write into a move what all runs share; return what writes the rest in each run."""
@@ -243,14 +238,6 @@ class SampleCall:
             return result, valid
 
         return read
-
-    def _read_vectors(self, hows: Mapping[str, How], values: Mapping[str, Tensor]) -> dict[str, Reader]:
-        """Give C the rays and what turns like them, and return their readers by name."""
-        call = self._call
-        turns = (structs.Turned * len(hows))()
-        call.turned, call.turned_count = call.keep(turns), len(turns)
-        pairs = zip(hows.items(), turns, strict=True)
-        return {name: self._vector_reader(turn, values[name], how) for (name, how), turn in pairs}
 
     def _vector_reader(self, turned: structs.Turned, like: Tensor, how: How) -> Reader:
         """Write into what turns what all runs share; return what writes the rest in each run."""
