@@ -10,24 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from camtorch.augment import wrong_fields
 from camtorch.augment.change import Change
 from camtorch.augment.matrices import SHAPE, SIDES, check_matrix, matrix_hint, moved_matrix
-from camtorch.augment.wrong_fields import (
-    CORNERS,
-    boxes_hint,
-    check_corners,
-    check_pitch_yaw,
-    check_pose,
-    column_hint,
-    image_hint,
-    keypoints_hint,
-    landmarks_hint,
-    no_check,
-    no_hint,
-    pose_hint,
-    rays_hint,
-    sides_check,
-)
 from camtorch.poses.gaze import from_pitch_yaw, to_pitch_yaw
 from camtorch.poses.rotations import rotation_matrix, rotation_vector
 from camtorch.values.arguments import check_radians
@@ -63,8 +48,8 @@ class Field:
     is_image: bool = False  # whether its last dims are those of the camera's image, and whole numbers stay whole
     tells_batches: bool = False  # whether its number of dims distinguishes a batch from a sample
     in_pixels: bool = False  # whether it is warned of numbers that hardly are pixels of the image
-    hint: Callable[[Tensor, str, bool], str] = no_hint  # (value, name, batched) -> what to do about a wrong shape
-    check: Callable[[Tensor, str, str], None] = no_check  # (value, name, owner); raises if values are of no such kind
+    hint: Callable[[Tensor, str, bool], str] | None = None  # (value, name, batched) -> what to do about a wrong shape
+    check: Callable[[Tensor, str, str], None] | None = None  # (value, name, owner); raises if values are not of it
 
     def __post_init__(self) -> None:
         self.most_dims = max(self.dims, self.most_dims)
@@ -145,8 +130,8 @@ def _sided_boxes(kind: str, words: str) -> Field:
         move=_by(Change.boxes, functools.partial(as_corners, kind), write),
         tells_batches=True,
         in_pixels=True,
-        hint=boxes_hint,
-        check=sides_check(kind.removeprefix("boxes_").upper(), shape),
+        hint=wrong_fields.boxes_hint,
+        check=wrong_fields.sides_check(kind.removeprefix("boxes_").upper(), shape),
     )
 
 
@@ -166,7 +151,7 @@ _DIRECTIONS = Field(
     shape="(B, *N, 3) directions of the camera frame",
     move=_by(Change.rays),
     together="rays",
-    hint=rays_hint,
+    hint=wrong_fields.rays_hint,
 )
 _POSE = Field(
     dims=2,
@@ -175,8 +160,8 @@ _POSE = Field(
     move=_pose,
     together="pose",
     tells_batches=True,
-    hint=pose_hint,
-    check=check_pose,
+    hint=wrong_fields.pose_hint,
+    check=wrong_fields.check_pose,
 )
 # the order counts where several kinds would do: whether a sample is a batch, and what a wrong name may have meant
 KINDS = {
@@ -187,7 +172,7 @@ KINDS = {
         together=_image_sampler,
         is_image=True,
         tells_batches=True,
-        hint=image_hint,
+        hint=wrong_fields.image_hint,
     ),
     "mask": Field(
         dims=2,
@@ -220,7 +205,7 @@ KINDS = {
         together="pixels",
         tells_batches=True,
         in_pixels=True,
-        hint=keypoints_hint,
+        hint=wrong_fields.keypoints_hint,
     ),
     "polygons": Field(
         dims=3,
@@ -233,13 +218,13 @@ KINDS = {
     "boxes": Field(
         dims=2,
         ends=[(4,)],
-        shape=CORNERS,
+        shape=wrong_fields.CORNERS,
         move=_by(Change.boxes),
         together="boxes",
         tells_batches=True,
         in_pixels=True,
-        hint=boxes_hint,
-        check=check_corners,
+        hint=wrong_fields.boxes_hint,
+        check=wrong_fields.check_corners,
     ),
     "boxes_xywh": _sided_boxes("boxes_xywh", "x, y, width, height"),
     "boxes_cxcywh": _sided_boxes("boxes_cxcywh", "x and y of the centre, width, height"),
@@ -251,7 +236,7 @@ KINDS = {
         move=lambda change, value, options: field_of("landmarks", value).move(change, value, options),
         tells_batches=True,
         in_pixels=True,
-        hint=landmarks_hint,
+        hint=wrong_fields.landmarks_hint,
     ),
     "points": Field(
         dims=1,
@@ -260,7 +245,7 @@ KINDS = {
         shape="(B, *N, 3) points of the camera frame",
         move=_by(Change.positions),
         together="rays",
-        hint=column_hint,
+        hint=wrong_fields.column_hint,
     ),
     "gaze": _DIRECTIONS,
     "directions": _DIRECTIONS,
@@ -270,7 +255,7 @@ KINDS = {
         ends=[(2,)],
         shape="(B, *N, 2) pitch and yaw of a gaze in radians",
         move=_by(Change.rays, from_pitch_yaw, to_pitch_yaw),
-        check=check_pitch_yaw,
+        check=wrong_fields.check_pitch_yaw,
     ),
     "head_pose": _POSE,
     "pose": _POSE,
@@ -281,7 +266,7 @@ KINDS = {
         move=_rvec,
         together="rotation vectors",
         tells_batches=True,
-        hint=column_hint,
+        hint=wrong_fields.column_hint,
         check=check_radians,
     ),
     "tvec": Field(
@@ -291,7 +276,7 @@ KINDS = {
         move=_by(Change.positions),
         together="rays",
         tells_batches=True,
-        hint=column_hint,
+        hint=wrong_fields.column_hint,
     ),
     "rotation": Field(
         dims=2,
@@ -299,7 +284,7 @@ KINDS = {
         shape="(B, 3, 3), turned so far",
         move=_by(Change.rays, _columns, _columns),
         together="columns",
-        hint=column_hint,
+        hint=wrong_fields.column_hint,
     ),
     "K": Field(
         dims=2, ends=SIDES, shape=SHAPE, move=moved_matrix, tells_batches=True, hint=matrix_hint, check=check_matrix

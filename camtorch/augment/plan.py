@@ -190,8 +190,9 @@ class Batch(NamedTuple):
             pairs = [move(change.row(i), kind, v.unsqueeze(0), options) for i, v in enumerate(value)]
             flags = [valid.squeeze(0) for _, valid in pairs if valid is not None]
             return [rows.squeeze(0) for rows, _ in pairs], flags or None
-        if self.must_check:
-            KINDS[kind].check(value, name, owner)
+        check = KINDS[kind].check
+        if self.must_check and check is not None:
+            check(value, name, owner)
         rows, valid = move(change, kind, value if batched else value.unsqueeze(0), options)
         return (rows, valid) if batched else (rows.squeeze(0), None if valid is None else valid.squeeze(0))
 

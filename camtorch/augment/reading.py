@@ -59,7 +59,8 @@ def check_fields(
             check_shape(kind, which, frame, batched and not several, owner)
             if mode is None:
                 continue
-            field.check(item, which, owner)
+            if field.check is not None:
+                field.check(item, which, owner)
             if kind == "image":
                 check_averaged(item, mode, which, owner)
             if len(size) == 2:
@@ -153,7 +154,7 @@ def check_shape(kind: str, name: str, value: Tensor, batched: bool, owner: str) 
     fits = not field.ends or any(shape[-len(end) :] == end for end in field.ends)
     if not fits or not field.dims <= len(shape) - batched <= field.most_dims:
         what = field.shape if batched else field.shape.replace("(B, ", "(")
-        hint = field.hint(value, name, batched)
+        hint = "" if field.hint is None else field.hint(value, name, batched)
         hint = f". {hint}" if hint else _hint(name)
         raise ValueError(f"{owner}: {name} must be {what}; got shape {shape}{hint}")
 

@@ -13,15 +13,6 @@ from camtorch.values.arguments import check_boxes
 CORNERS = "(B, M, 4) pixels x1, y1, x2, y2"
 
 
-def no_hint(value: Tensor, name: str, batched: bool) -> str:
-    """Return no hint."""
-    return ""
-
-
-def no_check(value: Tensor, name: str, owner: str) -> None:
-    """Check nothing."""
-
-
 def image_hint(value: Tensor, name: str, batched: bool) -> str:
     """Return the hint for images."""
     if value.ndim == 5:
