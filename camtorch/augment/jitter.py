@@ -12,6 +12,7 @@ from torch import Tensor
 
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.operators import CameraNumbers, opaque
+from camtorch.evaluate.door import in_transform, outside_transforms, without_derivatives
 from camtorch.lenses.drawing import covering
 from camtorch.native.structs import AMOUNTS, JITTER_PARTS, RIM
 from camtorch.rays.lattices import defined_or, movement, polar_rays, reach
@@ -40,6 +41,10 @@ def _shapes(camera: CameraNumbers, amounts: Tensor, nominal: Tensor) -> tuple[Te
 
 @opaque(_shapes)
 def _jittered(camera: Camera, amounts: Tensor, nominal: Tensor) -> tuple[Tensor]:
+    if in_transform():
+        with outside_transforms():
+            camera, amounts = camera.each(without_derivatives), without_derivatives(amounts)
+            return (jittered(camera, amounts, without_derivatives(nominal)),)
     count = camera.distortion.shape[-1]
     measured = measured_once(sensitivity, camera, camera.distortion, nominal).to(amounts).reshape(-1, count)
     steps = amounts.reshape(-1, AMOUNTS).repeat(1, -(-count // AMOUNTS))[:, :count] * measured

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
+from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
 from torch.autograd import forward_ad
 from torch.utils import _pytree
 from torch.utils._python_dispatch import _disable_current_modes
@@ -35,6 +36,20 @@ def in_transform() -> bool:
     """Whether a transform of torch.func is active."""
     # dynamo takes the result for an object, of which "is not None" is always true
     return not isinstance(torch._C._functorch.peek_interpreter_stack(), NoneType)
+
+
+@contextmanager
+def outside_transforms() -> Iterator[None]:
+    """Suspend transforms of torch.func in here, for values that none maps or differentiates; not in traced code."""
+    with temporarily_clear_interpreter_stack():
+        yield
+
+
+def without_derivatives(tensor: Tensor) -> Tensor:
+    """Return the values of a tensor for `outside_transforms`: what grad, jacrev and jacfwd made of it is taken off."""
+    while torch._C._functorch.is_gradtrackingtensor(tensor):
+        tensor = torch._C._functorch.get_unwrapped(tensor)
+    return tensor
 
 
 def in_graph(tensor: Tensor) -> bool:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from camtorch.cameras.operators import opaque
+from camtorch.evaluate.door import outside_transforms
 from camtorch.lenses.collection import entries
 from camtorch.models import KannalaBrandt
 from camtorch.native.structs import TO_FOLD
@@ -95,7 +96,8 @@ def _drawn_shapes(share: Tensor, *_: object) -> tuple[Tensor, Tensor, Tensor]:
 def _drawn(
     share: Tensor, size: tuple[int, int], low: float | None, high: float | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    lenses = lenses_for(size, None if low is None or high is None else (low, high))
+    with outside_transforms():  # the lenses are kept for later calls
+        lenses = lenses_for(size, None if low is None or high is None else (low, high))
     index = (share * len(lenses.reach)).long().clamp(0, len(lenses.reach) - 1).to(lenses.reach.device)
     intrinsics, distortion, reach = (column[index].to(share) for column in lenses)
     return intrinsics, distortion, reach

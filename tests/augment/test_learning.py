@@ -13,6 +13,7 @@ import camtorch as ct
 from camtorch import augment
 from camtorch.augment import kornia as adapter
 from camtorch.augment.sample import SampleTransform
+from camtorch.lenses import drawing
 
 SIZE, MOUNT = (48, 64), augment.RandomMount()
 GIVEN = {"Compose": ([MOUNT],), "RandomShutter": (0.02, 30), "Pad": (2,), "Rotate90": (1,), "BoxCrop": ((32, 32),)}
@@ -103,3 +104,30 @@ def test_a_sample_s_camera_learns_but_not_in_a_worker():
         (batch,) = DataLoader([sample], collate_fn=augment.collate, **options)
         assert not batch["image"].requires_grad
         assert not batch["camera"].intrinsics.requires_grad
+
+
+TRANSFORMED = {
+    "lens": lambda: augment.RandomLens(),
+    "camera": lambda: augment.RandomCamera(),
+    "formulas": lambda: augment.RandomLens("double_sphere", fov=(60, 70)),
+    "real": lambda: augment.RandomLens("real", fov=(60, 70)),
+}
+
+
+@pytest.mark.parametrize("name", TRANSFORMED)
+@pytest.mark.parametrize("transform", [torch.func.jacrev, torch.func.jacfwd])
+def test_derivatives_pass_through_drawn_lenses(name, transform):
+    lens, augmentation = lens_of().requires_grad_(False), TRANSFORMED[name]()
+    draw, keypoints = augmentation.draw(1), 8 + 30 * torch.rand(3, 2)
+
+    def by_keypoints(points):
+        return augmentation(keypoints=points, draw=draw, camera=lens)["keypoints"]
+
+    def by_camera(intrinsics):
+        return augmentation(keypoints=keypoints, draw=draw, camera=lens.replace(intrinsics=intrinsics))["keypoints"]
+
+    drawing._good.cache_clear()
+    drawing.lenses_for.cache_clear()
+    for function, value in ((by_keypoints, keypoints), (by_camera, lens.intrinsics)):
+        found, expected = transform(function)(value), torch.autograd.functional.jacobian(function, value)
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
