@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -71,23 +72,7 @@ def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> 
 
     max_error = errors.amax(-1)
     if bool((max_error > _ROUNDING).any()):
-        # (C,) the largest error near the highest peaks of errors (C, side^2): each moves to the best of finer nodes
-        lattice = source.lattice
-        count, side = len(errors), lattice.side
-        field = errors.view(count, 1, side, side)
-        peaks = torch.where(field == max_pool2d(field, 3, 1, 1), field, 0.0).flatten(1)
-        places = lattice.nodes().gather(1, peaks.topk(_PEAKS).indices[..., None].expand(-1, -1, 2))
-        share = torch.linspace(-1, 1, 7, dtype=errors.dtype, device=errors.device)
-        offsets = torch.cartesian_prod(share, share)
-        step = ((lattice.high - lattice.low) / (side - 1))[:, None, None]
-        for _ in range(_ROUNDS):
-            near = (places[:, :, None] + step * offsets).flatten(1, 2)
-            clamped = near.clamp(lattice.low[:, None], lattice.high[:, None])  # except for azimuths
-            near = clamped if lattice.are_pixels else torch.stack((clamped[..., 0], near[..., 1]), -1)
-            found, best = error_within(lattice.sampled(source.camera, near)).unflatten(1, (_PEAKS, -1)).max(-1)
-            places = near.unflatten(1, (_PEAKS, -1)).gather(2, best[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
-            step = step / 3
-        max_error = torch.maximum(max_error, found.amax(-1))
+        max_error = torch.maximum(max_error, _largest_near_peaks(errors, source, error_within))
         rim = ray_fan(max_angle[:, None] * (1 - 1e-12), _RIM)
         max_error = torch.maximum(max_error, error_within(views.seen(source.camera, source.image_size, rim)).amax(-1))
     rms = (errors.square().sum(-1) / inside.sum(-1).clamp(min=1)).sqrt()
@@ -96,3 +81,24 @@ def measure(target: CameraLike, k: Tensor, exact: Tensor, source: Reference) -> 
     mapped = mapped if every is rays else compared(every)[1] & reached(every)
     shown = every.valid & mapped & (every.angles <= max_angle[:, None]) & some[:, None]
     return rms, max_error, max_angle, shown.sum(-1) / every.valid.sum(-1).clamp(min=1)
+
+
+def _largest_near_peaks(errors: Tensor, source: Reference, error_at: Callable[[RayPixels], Tensor]) -> Tensor:
+    """Return the largest error (C,) near the highest peaks of errors (C, side^2): each moves to the best finer node."""
+    lattice = source.lattice
+    count, side = len(errors), lattice.side
+    field = errors.view(count, 1, side, side)
+    peaks = torch.where(field == max_pool2d(field, 3, 1, 1), field, 0.0).flatten(1)
+    places = lattice.nodes().gather(1, peaks.topk(_PEAKS).indices[..., None].expand(-1, -1, 2))
+    share = torch.linspace(-1, 1, 7, dtype=errors.dtype, device=errors.device)
+    offsets = torch.cartesian_prod(share, share)
+    step = ((lattice.high - lattice.low) / (side - 1))[:, None, None]
+    for _ in range(_ROUNDS):
+        near = (places[:, :, None] + step * offsets).flatten(1, 2)
+        clamped = near.clamp(lattice.low[:, None], lattice.high[:, None])  # except for azimuths
+        near = clamped if lattice.are_pixels else torch.stack((clamped[..., 0], near[..., 1]), -1)
+        found, best = error_at(lattice.sampled(source.camera, near)).unflatten(1, (_PEAKS, -1)).max(-1)
+        places = near.unflatten(1, (_PEAKS, -1)).gather(2, best[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
+        step = step / 3
+    largest: Tensor = found.amax(-1)
+    return largest

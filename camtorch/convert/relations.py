@@ -64,7 +64,8 @@ def _path(start: Model, end: Model, models: Models) -> list[Step] | None:
 def _neighbours(model: Model, models: Models) -> Iterator[Step]:
     for general in (model, *models.values()):
         for key, names in general.special_cases:
-            if (special := models.get(key)) is not None and general is model:
+            special = models.get(key)
+            if special is not None and general is model:
                 yield special, dict(zip(names, _all_names(special), strict=False))
             elif special is model:
                 yield general, dict(zip(_all_names(model), names, strict=False))

@@ -45,7 +45,10 @@ def _keywords(transform: Any) -> dict[str, None]:
             init, hints = vars(owner)["__init__"], {}
             _, *parameters = inspect.signature(init).parameters.values()
             names |= dict.fromkeys(p.name for p in parameters if p.kind is not p.VAR_KEYWORD)
-            if not parameters or (rest := parameters[-1].name) in names:
+            if not parameters:
+                break
+            rest = parameters[-1].name
+            if rest in names:
                 break
             with contextlib.suppress(NameError):  # of what is imported for checkers alone
                 hints = get_type_hints(init)
