@@ -16,7 +16,7 @@ from camtorch.calibration.model import Model, asked_model
 from camtorch.calibration.observations import Layout, Observations, Points, as_observations, repeats
 from camtorch.calibration.robust import Loss, as_loss
 from camtorch.calibration.start import other_cameras, start_from_nothing
-from camtorch.calibration.uncertainty import shared_factor, spread
+from camtorch.calibration.uncertainty import Spread, shared_factor, spread
 from camtorch.calibration.verdict import Calibration, check_determined
 from camtorch.cameras.camera import Camera
 from camtorch.poses.extrinsics import Extrinsics
@@ -110,11 +110,14 @@ class Search:
 
     @cached_property
     def observed(self) -> CameraObservations:
-        """The observations for an adjustment, with the prior of a surface that starts from a camera."""
+        """The observations for an adjustment, with the prior of a surface."""
+        return CameraObservations.of_one(self.asked.kind, self.centred, self._prior())
+
+    def _prior(self) -> Prior | None:
+        """Return the prior of a surface that starts from a camera, whose shape it keeps where nothing is seen."""
         kind, start, smooth = self.asked.kind, self.asked.start, self.asked.kind.smoothness()
         if start is None or smooth is None:
-            return CameraObservations.of_one(kind, self.centred)
-        # a surface keeps the start's shape if nothing is seen
+            return None
         like = self.seen.pixels
         core, coefficients = (t.detach().to(like).reshape(-1) for t in (start.intrinsics, start.distortion))
         axis = like.new_tensor([[0.0, 0.0, 1.0], [_BESIDE, 0.0, 1.0]])
@@ -125,8 +128,7 @@ class Search:
 
         # a surface can imitate a turn of the camera, so its frame is held at the start's
         rows = _SMOOTH * float(core[:2].mean()) * smooth.to(like), torch.func.jacrev(frame)(coefficients)
-        prior = Prior(torch.cat((core, coefficients)), torch.nn.functional.pad(torch.cat(rows), (4, 0)))
-        return CameraObservations.of_one(kind, self.centred, prior)
+        return Prior(torch.cat((core, coefficients)), torch.nn.functional.pad(torch.cat(rows), (4, 0)))
 
     def free(self, bend: bool = False) -> Free:
         """Return the unknowns of a search for this camera alone; `bend` adds the board's shape."""
@@ -180,6 +182,34 @@ class Search:
             return adjusted
         return adjust(observed, others.state.of(best), free, loss=self.loss, steps=STEPS)
 
+    def result(
+        self, camera: int, adjusted: Adjusted, spread: Spread, sigma: float, inliers: Tensor, again: Tensor
+    ) -> Calibration:
+        """Return the calibration of a camera by its index; inliers (V, N), and the indices of views seen `again`."""
+        seen, layout, state = self.seen, self.layout, adjusted.state
+        residuals, has_pixel = adjusted.residuals[camera][0], adjusted.valid[camera][0]
+        copies = layout.views[again[seen.seen[again].any(-1)]]
+        return Calibration(
+            camera=self.asked.camera(state.parameters[camera][0]),
+            extrinsics=extrinsics_of(state.boards_from(camera), self.middle),
+            rms=rms_of(residuals, seen.seen),
+            sigma=sigma,
+            residuals=layout.restore(torch.where(has_pixel[..., None], residuals, torch.nan), seen.seen),
+            inliers=layout.restore(inliers, seen.seen),
+            parameter_names=self.asked.names,
+            spread=spread,
+            converged=bool(adjusted.converged[0]) and bool((has_pixel | ~seen.seen).all()),
+            bend=(float(state.bend[0, 0]), float(state.bend[0, 1])),
+            image_size=layout.image_size,
+            views=tuple(layout.views.tolist()),
+            copies=tuple(copies.tolist()),
+            observations=seen,
+            adjusted=adjusted,
+            point_inliers=inliers,
+            loss=self.loss.name,
+            index=camera,
+        )
+
 
 def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> tuple[list[Calibration], Tensor]:
     """Return the calibrations at an optimum, or at a better one in another basin of a model, and the noise in px.
@@ -199,33 +229,11 @@ def results(searches: Sequence[Search], adjusted: Adjusted, free: Free) -> tuple
     inliers, sigma, noise = noise_of(residuals, seen, valid, loss, unknowns(observed, adjusted, int(views.sum())))
     again = repeats(given, [r[0] for r in adjusted.residuals])  # widen uncertainty as if they were missing
     noise = noise * math.sqrt(len(views) / (len(views) - len(again)))
-    cameras, state = [], adjusted.state
-    for c, (search, own) in enumerate(zip(searches, inliers.split(len(views)), strict=True)):
-        asked, one, layout = search.asked, search.seen, search.layout
-        copies = layout.views[again[one.seen[again].any(-1)]].tolist()
-        off, has_pixel = adjusted.residuals[c][0], adjusted.valid[c][0]
-        camera = Calibration(
-            camera=asked.camera(state.parameters[c][0]),
-            extrinsics=extrinsics_of(state.boards_from(c), search.middle),
-            rms=rms_of(off, one.seen),
-            sigma=float(sigma),
-            residuals=layout.restore(torch.where(has_pixel[..., None], off, torch.nan), one.seen),
-            inliers=layout.restore(own, one.seen),
-            parameter_names=asked.names,
-            spread=spreads[c].scaled(noise.reshape(1)),
-            converged=bool(adjusted.converged[0]) and bool((has_pixel | ~one.seen).all()),
-            bend=(float(state.bend[0, 0]), float(state.bend[0, 1])),
-            image_size=layout.image_size,
-            views=tuple(layout.views.tolist()),
-            copies=tuple(copies),
-            observations=one,
-            adjusted=adjusted,
-            point_inliers=own,
-            loss=loss.name,
-            index=c,
-        )
-        cameras.append(camera)
-    return cameras, noise
+    found = [
+        search.result(c, adjusted, spreads[c].scaled(noise.reshape(1)), float(sigma), own, again)
+        for c, (search, own) in enumerate(zip(searches, inliers.split(len(views)), strict=True))
+    ]
+    return found, noise
 
 
 def extrinsics_of(boards: Poses, middle: Tensor) -> Extrinsics:
