@@ -13,7 +13,7 @@ from camtorch.augment.cameras import known_camera
 from camtorch.augment.change import Change, by_models, check_sizes, one_or_batch
 from camtorch.augment.devices import Elsewhere, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
-from camtorch.augment.filling import enough, scaled, tell_of_narrow_images, warn_if_empty, warn_of_unfilled
+from camtorch.augment.filling import scaled, tell_of_narrow_images, warn_if_empty, warn_of_unfilled, zoom_to_fill
 from camtorch.augment.matrices import Guess
 from camtorch.augment.part import Part
 from camtorch.augment.ranges import (
@@ -274,7 +274,7 @@ class Augmentation(SampleTransform):
         """Return the camera of drawn values and its rotation, zoomed and turned less far for `min_filled`."""
         target, rotation = self._new_camera(source, values)
         if self.min_filled:
-            factor, turned, found = enough(source, target, rotation, self.min_filled)
+            factor, turned, found = zoom_to_fill(source, target, rotation, self.min_filled)
             target, rotation = scaled(target, factor), None if rotation is None else turned
             self._tell_of_unfilled(source, lambda: target, factor, found)
         return target, rotation

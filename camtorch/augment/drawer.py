@@ -11,10 +11,10 @@ from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation, AugmentationOptions
 from camtorch.augment.devices import twin_of
-from camtorch.augment.filling import enough, scaled
+from camtorch.augment.filling import scaled, zoom_to_fill
 from camtorch.augment.jitter import jittered
 from camtorch.augment.native_draws import DRAWN_SIZES, Start, Wanted, too_wide
-from camtorch.augment.part import LazyWarp, Part
+from camtorch.augment.part import Part
 from camtorch.augment.presets import REAL, as_like
 from camtorch.augment.ranges import TURN, Draw, Range, RangeLike, as_range, as_tensors, values_for
 from camtorch.cameras.camera import Camera
@@ -169,10 +169,10 @@ class CameraDrawer(Augmentation):
         if start is None:
             target, rotation = self._filled_camera(source, values)
         else:
-            made = start.warp(source, values, self.options)
-            if self.min_filled:
-                self._tell_if_zoomed(source, made)
             options = self.options
+            made, zooms, filled = start.warp(source, values, options)
+            if self.min_filled and (min(filled, default=1) < self.min_filled or max(zooms, default=1) > 1):
+                self._tell_of_unfilled(source, lambda: made.target, torch.tensor([*zooms]), torch.tensor([*filled]))
             may_stay_lazy = made.natives is not None and options["tolerance"] and not options["antialias"]
             if may_stay_lazy and self.beside_the_camera.isdisjoint(self.ranges):
                 return Part(source, made)  # of numbers, which become a `Warp` at first use
@@ -192,13 +192,6 @@ class CameraDrawer(Augmentation):
             natural = vignetting(target, beside["cos4"])
             light = natural if light is None else light * natural
         return Part(source, warp, (others[0], others[1]) if others else None, light)
-
-    def _tell_if_zoomed(self, source: Camera, made: LazyWarp) -> None:
-        """Warn of what native code found for `min_filled`, if it took a zoom, or more than there is."""
-        are_filled = min(made.filled, default=1) >= (self.min_filled or 0.0)
-        if not are_filled or max(made.zooms, default=1) > 1:
-            zooms, filled = torch.tensor([*made.zooms]), torch.tensor([*made.filled])
-            self._tell_of_unfilled(source, lambda: made.target, zooms, filled)
 
     def _start(self, source: Camera, values: Mapping[str, Any]) -> Start | None:
         """Return what native code starts from for values of these names, kept while the cameras' numbers stay.
@@ -305,7 +298,7 @@ class CameraDrawer(Augmentation):
             if base.image_size is None:
                 sized = _as_wide(base, sized, torch.rad2deg(field_of_view(source)[..., 0]), size[1], self._name)
             whole = remade(base, intrinsics=sized.to(base.intrinsics.dtype), image_size=size)
-            return scaled(whole, enough(source, whole, None, 1.0)[0]).intrinsics.detach()
+            return scaled(whole, zoom_to_fill(source, whole, None, 1.0)[0]).intrinsics.detach()
 
         key = "source", type(source), source.image_size, type(base), base.image_size, size
         return self._memo(source.tensors + base.tensors, key, narrowed)

@@ -73,12 +73,14 @@ def scaled(camera: Camera, factor: Tensor) -> Camera:
     return remade(camera, intrinsics=camera.intrinsics * scale)
 
 
-def enough(source: Camera, target: Camera, rotation: Tensor | None, share: float) -> tuple[Tensor, Tensor, Tensor]:
+def zoom_to_fill(
+    source: Camera, target: Camera, rotation: Tensor | None, share: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return the zoom (*B,) and the rotation (*B, 3, 3), turned less far, that fill `share`, and the part filled."""
     with torch.no_grad():
         if rotation is None:
             rotation = torch.eye(3, dtype=target.intrinsics.dtype, device=target.intrinsics.device)
-        factor, turned, found = _enough(source.detach(), target.detach(), rotation, with_care(share))
+        factor, turned, found = _zoom_to_fill(source.detach(), target.detach(), rotation, with_care(share))
         return factor, turned, found
 
 
@@ -96,7 +98,7 @@ def _shapes(
 
 
 @opaque(_shapes)
-def _enough(source: Camera, target: Camera, rotation: Tensor, share: float) -> tuple[Tensor, Tensor, Tensor]:
+def _zoom_to_fill(source: Camera, target: Camera, rotation: Tensor, share: float) -> tuple[Tensor, Tensor, Tensor]:
     part_shown = partial(_part_shown, source, target, _points(target))
     found = part_shown(rotation)
     factor = torch.ones_like(found)

@@ -9,7 +9,7 @@ end, `Start.of` returns None.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from ctypes import addressof, c_char, c_double, sizeof
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -152,8 +152,14 @@ class Start:
                 setattr(start.domain, name, start.keep(radii.contiguous()))
             self._limits = 0 if plan.is_radial else structs.AZIMUTHS + structs.EXTENT
 
-    def warp(self, source: Camera, values: Mapping[str, Any], options: Options) -> LazyWarp:
-        """Return the warp from the source to new cameras of values (B,) and (B, size), or numbers and lists for one."""
+    def warp(
+        self, source: Camera, values: Mapping[str, Any], options: Options
+    ) -> tuple[LazyWarp, Sequence[float], Sequence[float]]:
+        """Return the warp from the source to new cameras of values (B,) and (B, size), or numbers and lists for one.
+
+        Also the factors (B,) on focal lengths for `min_filled`, and the part of each image that is filled then, (B,);
+        both are empty if nothing has to be filled.
+        """
         drawn, batch = self._packed(values)
         rows = batch[0] if batch else 1
         memory_type, layout = _room(self._number, batch, self._struct.count, self._rest)
@@ -182,7 +188,7 @@ class Start:
         natives = None if native is None else (self._source_native, native)
         size, base = self._wanted.size, self._wanted.base
         like = source if base is self._wanted.source else base
-        return LazyWarp(like, room["intrinsics"], k, size, rotation, options, natives, zooms, filled)
+        return LazyWarp(like, room["intrinsics"], k, size, rotation, options, natives), zooms, filled
 
     def _packed(self, values: Mapping[str, Any]) -> tuple[Any, tuple[int, ...]]:
         """Return drawn values as C takes them, and (B,), which is () for numbers and lists of one camera."""

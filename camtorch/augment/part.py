@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -39,8 +39,6 @@ class LazyWarp:
     rotation: Tensor | None  # (3, 3) or (B, 3, 3), or None
     options: Options  # of the warp
     natives: tuple[Native, Native] | None  # the cameras before and the new ones, for native code; None if it lacks any
-    zooms: Sequence[float] = ()  # (B,): the factors on focal lengths that `min_filled` asks for; empty if it does not
-    filled: Sequence[float] = ()  # (B,): the part of each image that is filled then
     may_mirror: bool = False  # whether the rotation may be a mirror, as after a flip
     _warp: Warp | None = field(default=None, init=False)  # `warp()`, once it was called
     _target: Camera | None = field(default=None, init=False)  # `target`, once it was read

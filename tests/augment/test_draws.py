@@ -6,7 +6,7 @@ from cameras import DISTINCT, KEYS, needs_library, slow_unless, spread
 
 import camtorch as ct
 from camtorch.augment.drawer import CameraDrawer
-from camtorch.augment.filling import enough, scaled
+from camtorch.augment.filling import scaled, zoom_to_fill
 from camtorch.evaluate.kept import Kept
 from camtorch.projection import native_cameras
 
@@ -47,7 +47,7 @@ def test_as_the_formula(key, name, dtype, count, recwarn, monkeypatch):
     values = {name: value if count > 1 else value[0] for name, value in draw.items() if name != "apply"}
     expected, rotation = augmentation.new_camera(source, values)
     if augmentation.min_filled:
-        factor, turned, _ = enough(source, expected, rotation, augmentation.min_filled)
+        factor, turned, _ = zoom_to_fill(source, expected, rotation, augmentation.min_filled)
         expected, rotation = scaled(expected, factor), None if rotation is None else turned
     found = change.target if count > 1 else change.target[0]
     assert type(found) is type(expected)
