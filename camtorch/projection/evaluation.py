@@ -70,7 +70,11 @@ def evaluate_rows(
     intrinsics, distortion = per_row(tensors, lead, rows)
     way = way_of(model.__name__, rows, intrinsics, distortion)
     if constant is not None and not way.is_native and is_constant(constant) and all(type(side) is int for side in lead):
-        return _exported(model, direction, rows, lead, cameras_of, constant)
+        with with_values(constant):
+            intrinsics, distortion = per_row(constant.tensors, lead, rows)
+            cameras = cameras_of(intrinsics, distortion).as_constant()
+        with portable_export():
+            return direction.formula(model, rows, intrinsics, distortion, cameras)
     known = cameras_of(intrinsics, distortion) if way.is_known else None
     native = known.native if known is not None and way.is_native else None
     if native is not None and way.learns:
@@ -87,22 +91,6 @@ def evaluate_rows(
     if few or not are_free(rows, intrinsics, distortion):
         return direction.formula(model, rows, intrinsics, distortion, known)
     return _by_blocks(lambda block: direction.formula(model, block, intrinsics, distortion, known), rows, direction)
-
-
-def _exported(
-    model: type[CameraLike],
-    direction: Direction,
-    rows: Tensor,
-    lead: torch.Size,
-    cameras_of: Callable[[Tensor, Tensor], CameraRows],
-    constant: CameraLike,
-) -> tuple[Tensor, Tensor]:
-    """Return the results of `evaluate_rows` as an exported program has them, which holds the camera as a constant."""
-    with with_values(constant):
-        intrinsics, distortion = per_row(constant.tensors, lead, rows)
-        cameras = cameras_of(intrinsics, distortion).as_constant()
-    with portable_export():
-        return direction.formula(model, rows, intrinsics, distortion, cameras)
 
 
 def _by_blocks(

@@ -40,7 +40,7 @@ class ModelPlan:
 
     def __init__(self, chart: Chart, lens: Lens, parts: Sequence[structs.Part], coefficients: Sequence[Tensor]):
         """Make the plan of optics whose coefficients are columns, whatever their values."""
-        self.parts, self.count = (structs.Part * len(parts))(*parts), len(parts)
+        self.parts = (structs.Part * len(parts))(*parts)
         parameters = (*chart.parameters, *lens.parameters)
         self.parameters = len(parameters)
         # which coefficient each parameter is, as the same tensor; None if the model computes some
@@ -110,7 +110,8 @@ class NativeLenses:
         """Return the lenses of coefficients (C, n) with their domains."""
         struct = structs.Cameras(cameras=len(k), is_double=k.dtype == torch.float64)
         struct.hold(k)
-        struct.parts, struct.part_count, struct.parameter_count = addressof(plan.parts), plan.count, plan.parameters
+        struct.parts, struct.part_count = addressof(plan.parts), len(plan.parts)
+        struct.parameter_count = plan.parameters
         lenses = cls(plan, optics_of, k, struct)
         if plan.parameters:
             struct.parameters = lenses._keep(plan.parameters_of(optics_of, k))
@@ -133,7 +134,8 @@ class NativeLenses:
         """The request for the domain, with optics in double precision."""
         plan, k = self.plan, self.k
         made = structs.Domain(is_double=self.struct.is_double, cameras=self.struct.cameras, is_radial=plan.is_radial)
-        made.parts, made.part_count, made.parameter_count = addressof(plan.parts), plan.count, plan.parameters
+        made.parts, made.part_count = addressof(plan.parts), len(plan.parts)
+        made.parameter_count = plan.parameters
         # parameters that the model computes are computed in double precision
         given = k if plan.places is not None else k.double()
         parameters = plan.parameters_of(self.optics_of, given) if plan.parameters else k
