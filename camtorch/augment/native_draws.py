@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
 from ctypes import addressof, c_char, c_double, sizeof
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -182,9 +182,10 @@ class Start:
         room = np.ndarray((), layout, memory)  # in less time than tensors
         rotation = torch.from_numpy(room["rotation"]) if self._turns else None
         k = room["distortion"] if self._rest else self._distortion
-        draws.hold((memory, limits if draws.followed == rows else None))
+        if limits is not None and draws.followed == rows:
+            draws.hold(limits)
         # some numbers may be no camera's
-        native = self._native(draws, k) if self._is_flat and not left else None
+        native = self._native(draws, room) if self._is_flat and not left else None
         natives = None if native is None else (self._source_native, native)
         size, base = self._wanted.size, self._wanted.base
         like = source if base is self._wanted.source else base
@@ -235,21 +236,28 @@ class Start:
             ends = measured_once(lens_ends, base, base.distortion.detach())
             self._struct.ends = self._keep_each(ends, *ends.shape[-2:])
 
-    def _native(self, draws: structs.Draws, k: np.ndarray[Any, Any]) -> Native | None:
-        """Return the cameras that C made, of coefficients (B, n) or (n,), as native code takes them.
+    def _native(self, draws: structs.Draws, room: np.ndarray[Any, Any]) -> Native | None:
+        """Return the cameras that C made, as native code takes them.
 
         None for several cameras with one lens, that of the base, as native code takes as many lenses as cameras.
         """
-        base, made = self._base_native, draws.made  # which keeps `draws` alive, and that the memory
-        if self._rest:
-            return Native(base.plan, made, lambda: self._new_lenses(made, k))
-        return Native(base.plan, made, lambda: base.lenses) if made.cameras == base.cameras else None
+        if not self._rest and draws.cameras != self._base_native.cameras:
+            return None
+        made = draws.made  # it keeps `draws` alive, and the function for the lenses keeps the memory
+        return Native(self._base_native.plan, made, partial(self._lenses, made, room))
 
-    def _new_lenses(self, made: structs.Cameras, k: np.ndarray[Any, Any]) -> NativeLenses:
-        """Return the lenses that C made, kept for later cameras of the same coefficients."""
-        plan, coefficients = self._base_native.plan, torch.from_numpy(k.reshape(made.cameras, self._struct.count))
-        optics = model_of(self._wanted.base).optics
-        return lenses_of(plan, coefficients, lambda: NativeLenses(plan, optics, coefficients, made))
+    def _lenses(self, made: structs.Cameras, room: np.ndarray[Any, Any]) -> NativeLenses:
+        """Return the lenses of cameras that C made in that memory; new ones are kept for later cameras like these."""
+        if not self._rest:
+            return self._base_native.lenses
+        plan, optics = self._base_native.plan, model_of(self._wanted.base).optics
+        k = torch.from_numpy(room["distortion"].reshape(made.cameras, self._struct.count))
+
+        def new() -> NativeLenses:
+            made.hold(room)
+            return NativeLenses(plan, optics, k, made)
+
+        return lenses_of(plan, k, new)
 
 
 def _can_make_lenses(base: Camera, native: Native) -> bool:
