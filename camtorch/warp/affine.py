@@ -241,12 +241,7 @@ class AffineWarp(HalvingWarp):
 
 
 def made_like(
-    warp: Warp,
-    source: Camera,
-    target: Camera,
-    rotation: Tensor | None,
-    options: Options,
-    rows: list[int] | None = None,
+    warp: Warp, source: Camera, target: Camera, rotation: Tensor | None, options: Options, rows: list[int] | None = None
 ) -> Warp:
     """Return a warp like another one, or these rows of it, between other cameras; the rotation is not checked."""
     if warp.moves_by_cameras:

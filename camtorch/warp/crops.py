@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any, Unpack, cast
 
 import torch
@@ -13,7 +12,6 @@ from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import keeps_graph
 from camtorch.evaluate.kept import Kept
 from camtorch.values.arguments import Numbers, as_values
-from camtorch.warp.arrays import Image, warped_alike
 from camtorch.warp.lattice import PixelPositions
 from camtorch.warp.options import Fill, Mode, PaddingMode, TolerantOptions, as_options
 from camtorch.warp.sampling import render
@@ -57,19 +55,9 @@ class CropsWarp(Warp):
 
         return self._rows.unless_learning(self.tensors, (*self.form, *self.options.values()), made)
 
-    def forward(
-        self,
-        images: Image,
-        *,
-        mode: Mode | None = None,
-        padding_mode: PaddingMode | None = None,
-        fill: Fill | None = None,
-    ) -> Image:
-        """Warp images, and return the same kind with the dims (B, F); see the class, and `Warp.forward`."""
-        if not isinstance(images, Tensor):
-            warp = partial(self.forward, mode=mode, padding_mode=padding_mode, fill=fill)
-            device = self.source.intrinsics.device
-            return warped_alike(images, self.source.size_for("Warp"), "Warp", warp, device)  # type: ignore[no-any-return]
+    def _of_tensor(
+        self, images: Tensor, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None
+    ) -> Tensor:
         batch, lead, rows = self.batch_shape, images.shape[:-3], self.by_rows
         if lead not in (batch, batch[:1], (1,)) or images.ndim < 4:
             b, f = batch
@@ -80,13 +68,13 @@ class CropsWarp(Warp):
         if len(lead) == 2 or len(images) == 1:
             one_by_one = images.flatten(0, 1) if len(lead) == 2 else images
             made = rows.forward(one_by_one, mode=mode, padding_mode=padding_mode, fill=fill)
-            return torch.unflatten(made, 0, batch)  # type: ignore[return-value]  # the images are a tensor
+            return torch.unflatten(made, 0, batch)
         sampler = checked(rows, images[:1], mode, padding_mode, fill)
         # the crops of an image are sampled as one, the first on top
         where = rows.by_pixel()
         parts = [None if part is None else part.unflatten(0, batch).flatten(1, 2) for part in where]
         made = render(rows.lengthened(images), PixelPositions(*parts), sampler)  # type: ignore[arg-type]
-        return torch.unflatten(made, 2, (batch[1], self.target.height)).movedim(2, 1).contiguous()  # type: ignore[return-value]
+        return torch.unflatten(made, 2, (batch[1], self.target.height)).movedim(2, 1).contiguous()
 
     def strips(self, *args: Any, **options: Any) -> Iterator[Any]:
         """Raise: `warp.by_rows`, a warp for images (B * F, C, H, W), has strips."""

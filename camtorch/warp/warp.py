@@ -145,17 +145,21 @@ class Warp(RoutedWarp):
                 colours of a PIL image are a palette's, several come of one, or other integers would be averaged.
             TypeError: If images are none of these kinds, or complex.
         """
+        made: Any  # of the kind of the images
         call: Any = self.ready(images, mode, padding_mode) if fill is None else None
-        made: Any = self._without_kept_call(images, mode, padding_mode, fill) if call is None else call(images)
-        return made  # type: ignore[no-any-return]  # of the kind of the images
-
-    def _without_kept_call(
-        self, images: Any, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None
-    ) -> Any:
-        """Return the result of `forward` for images that no kept call fits."""
-        if not isinstance(images, Tensor):
+        if call is not None:
+            made = call(images)
+        elif isinstance(images, Tensor):
+            made = self._of_tensor(images, mode, padding_mode, fill)
+        else:
             warp = partial(self.forward, mode=mode, padding_mode=padding_mode, fill=fill)
-            return warped_alike(images, self.source.size_for("Warp"), "Warp", warp, self.source.intrinsics.device)
+            made = warped_alike(images, self.source.size_for("Warp"), "Warp", warp, self.source.intrinsics.device)
+        return made  # type: ignore[no-any-return]
+
+    def _of_tensor(
+        self, images: Tensor, mode: Mode | None, padding_mode: PaddingMode | None, fill: Fill | None
+    ) -> Tensor:
+        """Return the result of `forward` for a tensor that no kept call fits."""
         sampler = checked(self, images, mode, padding_mode, fill)
         if images.ndim == 4:
             return self.warped(images, sampler)
@@ -165,7 +169,8 @@ class Warp(RoutedWarp):
             return made.view(*lead, *made.shape[1:])
         # the frames of a clip are channels for its camera
         each = sampler.fill if len(sampler.fill) == 1 else sampler.fill * math.prod(lead[1:])
-        return self.warped(images.flatten(1, -3), sampler._replace(fill=each)).unflatten(1, images.shape[1:-2])
+        made = self.warped(images.flatten(1, -3), sampler._replace(fill=each))
+        return torch.unflatten(made, 1, images.shape[1:-2])
 
     if TYPE_CHECKING:
 
