@@ -21,7 +21,7 @@ NOT_EXPORTED = (*INSIDE, *REFUSED, *LONG, "FaceNormalizer", "CanonicalCamera", "
 LONG_COMPILED = ("CameraHead", "Compose: mount", "Compose: crop, mount", "Compose: flip, lens", "FaceNormalizer")
 LONG_COMPILED += ("RandomCamera", "RandomLens", "ShutterWarp", "labels:", "CenterCrop", "Compose: crop, crop")
 LONG_COMPILED += ("Compose: crop, flip", "Compose: size", "RandomCrop", "RandomResized", "Resize,", "Rotate90")
-LONG_COMPILED += ("VerticalFlip",)
+LONG_COMPILED += ("VerticalFlip", "Pad", "BirdsEye", "Reproject, sweep", "Warp, float64")
 """Calls that torch.compile traces for long; its second trace (AOTAutograd) sees the like in others, as RandomMount."""
 BOTH = {f"Warp, {mode}, {padding}" for mode in set(MODES) - {"bilinear"} for padding in set(PADDINGS) - {"zeros"}}
 """Not recorded: what is recorded asks for the mode or for the padding, and torch's sampler takes both as they are."""
