@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from camtorch.augment.fields import PLACE, Named
+from camtorch.augment.fields import KINDS, PLACE, Named
 from camtorch.augment.matrices import check_alike
 from camtorch.augment.names import kind_of
 from camtorch.augment.reading import moving
@@ -47,7 +47,7 @@ class Clips:
                 check_alike(name, given[name], owner)
             elif kind == "K":
                 per_clip.append(name)
-        found = {name for name, kind in kinds.items() if kind is not None and name not in per_clip}
+        found = {name for name, kind in kinds.items() if kind in KINDS and name not in per_clip}
         found |= {f"{name}_valid" for name in found} | {"image_valid", *tables}
         per_frame = [name for name in given if name in found]
         return cls(sample, per_frame, per_clip, tuple(given[image].shape[:2]), image, owner)

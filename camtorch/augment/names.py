@@ -4,7 +4,7 @@ import difflib
 import functools
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -24,33 +24,43 @@ _WORDS_OF_KINDS = {
 _ANGLES = {"yaw", "pitch", "roll"}
 
 
-def kind_of(name: str, value: object, fields: Mapping[str, str], owner: str, single: bool = False) -> str | None:
-    """Return a field's key in `KINDS`, None if it is not moved; raise if it may be geometry of unknown name.
+def kind_of(name: str, value: object, fields: Mapping[str, str], owner: str) -> str | None:
+    """Return a field's key in `KINDS`, `KEEP` if it does not move, and None if its name is unknown.
 
     In this order: the name among `fields`; names of `OWN` and those that end with _valid do not move; a kind's name or
     an alias; a pattern with * among `fields`; the longest kind that begins the name; the forms of boxes that end it.
 
-    fields: the option of that name. single: whether the sample is known to be without a dim B.
+    fields: the option of that name.
     """
     if not isinstance(name, str):
         raise TypeError(f"{owner}: a sample must have strings for names; got {name!r:.80}")
     if name in fields:
         return _given_kind(name, fields, owner)
     if name in OWN or name.endswith("_valid"):
-        return None
+        return KEEP
     kind = name if name in KINDS else ALIASES.get(name)
-    pattern = pattern_of(name, fields) if kind is None else None
-    if pattern is not None:
-        return _given_kind(pattern, fields, owner)
-    if kind == "K":
-        return _kind_of_matrix(name, value, single)
-    kind = kind or _beginning(name, value)
+    if kind is None:
+        pattern = _pattern_of(name, fields)
+        if pattern is not None:
+            return _given_kind(pattern, fields, owner)
+        kind = _beginning(name, value)
+    if kind == "K" and not _may_be_geometry(kind, value, single=False):  # a number of things, or a file's path
+        return KEEP
     if kind == "boxes":
         form = f"boxes_{name.rpartition('_')[2]}"  # as of boxes_face_xywh
-        kind = form if form in BOXES else kind
-    if kind is None and _may_be_geometry(name, value, single):
-        _refuse_unknown(name, value, owner)
+        return form if form in BOXES else kind
     return kind
+
+
+def refuse_unknown(sample: Mapping[str, Any], fields: Mapping[str, str], single: bool, owner: str) -> None:
+    """Raise a ValueError if a field of unknown name may be geometry.
+
+    fields: name -> kind, of other names. single: whether the sample is known to be without a dim B.
+    """
+    for name, value in sample.items():
+        is_unknown = value is not None and kind_of(name, value, fields, owner) is None
+        if is_unknown and _may_be_geometry(name, value, single):
+            raise ValueError(f"{owner}: {_about_unknown(name, value)}")
 
 
 def check_kinds(fields: Mapping[str, str], own: Iterable[str], owner: str) -> None:
@@ -66,20 +76,12 @@ def check_kinds(fields: Mapping[str, str], own: Iterable[str], owner: str) -> No
         )
 
 
-def _given_kind(key: str, fields: Mapping[str, str], owner: str) -> str | None:
-    """Return the kind that a key of `fields` gives; None to keep the field as it is."""
+def _given_kind(key: str, fields: Mapping[str, str], owner: str) -> str:
+    """Return the kind that a key of `fields` gives, which may be `KEEP`."""
     kind = fields[key]
-    if kind == KEEP:
-        return None
-    if kind not in KINDS:  # which was set after the transform was made
+    if kind not in KINDS:  # another one may have been set after the transform was made
         check_kinds({key: kind}, (), owner)
     return kind
-
-
-def _kind_of_matrix(name: str, value: object, single: bool) -> str | None:
-    """Return the kind of what is named as a camera's matrix: a number of things, or a file's path, may be named so."""
-    is_array = isinstance(value, (Tensor, np.ndarray)) and value.ndim > 1
-    return "K" if is_array or _may_be_geometry(name, value, single) else None
 
 
 def _beginning(name: str, value: object) -> str | None:
@@ -91,11 +93,11 @@ def _beginning(name: str, value: object) -> str | None:
     return begins[-1] if begins else None
 
 
-def _refuse_unknown(name: str, value: object, owner: str) -> NoReturn:
-    """Raise the ValueError for geometry of unknown name, which says what it may be."""
+def _about_unknown(name: str, value: object) -> str:
+    """Return the text of the error about geometry of unknown name, which says what it may be."""
     if isinstance(value, Mapping):
-        raise ValueError(
-            f"{owner}: fields that move must be at the top of samples; got real numbers in the dict {name!r}. "
+        return (
+            f"fields that move must be at the top of samples; got real numbers in the dict {name!r}. "
             f"Put them there, or keep the dict with fields={{{name!r}: '{KEEP}'}}"
         )
     if not {"K", "intrinsics", "matrix"}.isdisjoint(name.split("_")):
@@ -104,13 +106,13 @@ def _refuse_unknown(name: str, value: object, owner: str) -> NoReturn:
         meant = "A head's angles go in as head_pose, by ct.head_rotation(), a gaze's as pitch_yaw. "
     else:
         meant = "".join(f"Did you mean {kind!r}? " for kind in _close_to(name))
-    raise ValueError(
-        f"{owner}: {name!r} must have a kind, by which its numbers move with the camera; got real numbers. {meant}"
+    return (
+        f"{name!r} must have a kind, by which its numbers move with the camera; got real numbers. {meant}"
         f"Pass fields={{{name!r}: KIND}}, with KIND one of {', '.join(KINDS)} or {KEEP}, to leave it unchanged"
     )
 
 
-def pattern_of(name: str, fields: Mapping[str, str]) -> str | None:
+def _pattern_of(name: str, fields: Mapping[str, str]) -> str | None:
     """Return the first key of `fields` that a name matches, of those in which each * stands for any characters."""
     for key in fields:
         if "*" in key and re.fullmatch(re.escape(key).replace(r"\*", ".*"), name, re.DOTALL):

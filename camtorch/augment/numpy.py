@@ -20,7 +20,7 @@ from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.fields import IMAGES, KINDS, PLACE
 from camtorch.augment.front_end import FrontEnd, check_front_end
-from camtorch.augment.names import ALIASES, kind_of
+from camtorch.augment.names import ALIASES, kind_of, refuse_unknown
 from camtorch.augment.sample import Sample, Single
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
@@ -140,13 +140,13 @@ class Transform(FrontEnd):
 
     def _kind(self, name: str, value: Any, sample: Mapping[str, Any]) -> str | None:
         """Return the kind of a field, or of the field whose validity it is; None if it is not moved."""
-        kind = kind_of(name, value, self.augmentation.fields, _OWNER, single=True)
-        if kind is None and name.endswith(_VALID):
+        kind = kind_of(name, value, self.augmentation.fields, _OWNER)
+        if kind not in KINDS and name.endswith(_VALID):
             name = name.removesuffix(_VALID)
-            kind = kind_of(name, sample.get(name), self.augmentation.fields, _OWNER, single=True)
+            kind = kind_of(name, sample.get(name), self.augmentation.fields, _OWNER)
             if kind in IMAGES and np.ndim(value) <= 1:  # a flag for each sample
                 return None
-        return kind
+        return kind if kind in KINDS else None
 
     def _ways(self, sample: Sample, camera: Any) -> dict[str, Way]:
         """Return the way of each field, which are kept by the form of the sample."""
@@ -159,6 +159,7 @@ class Transform(FrontEnd):
 
     def _new_ways(self, sample: Sample, camera: Any) -> dict[str, Way]:
         """Return the way of each field, which its form alone decides: of images, of one, of numbers, or of all else."""
+        refuse_unknown(sample, self.augmentation.fields, True, _OWNER)
         ways, mirroring = dict[str, Way](), self.augmentation.mirroring
         size = getattr(self.augmentation.camera if camera is None else camera, "image_size", None)
         for name, value in sample.items():
@@ -256,7 +257,7 @@ def _form_of(sample: Sample) -> tuple[Any, ...] | None:
 
 def shaped_if_empty(array: Any, kind: str | None) -> Any:
     """Return an array; one without numbers in the shape of no values of a kind, as (0, 2) for keypoints."""
-    if array.size or kind is None or not KINDS[kind].ends:
+    if array.size or kind not in KINDS or not KINDS[kind].ends:
         return array
     rows = max(KINDS[kind].dims - 1, 1)
     return array.reshape(*(0,) * rows, KINDS[kind].ends[0][-1])

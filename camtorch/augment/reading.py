@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from camtorch.augment.fields import FRONT_ENDS, IMAGES, KEEP, KINDS, Named
-from camtorch.augment.names import kind_of
+from camtorch.augment.names import kind_of, refuse_unknown
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import is_cheap_to_read
 from camtorch.evaluate.tensors import known_true
@@ -22,19 +22,19 @@ _RANKS = {kind: (not field.tells_batches, i) for i, (kind, field) in enumerate(K
 """Kinds that tell a batch from a sample first, then in the order of `KINDS`."""
 
 
-def moving(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str, single: bool = False) -> Named:
-    """Return the fields that move, at least one.
-
-    fields: name -> kind, of other names. single: whether the sample is known to be without a dim B.
-    """
+def moving(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str) -> Named:
+    """Return the fields that move, at least one; fields: name -> kind, of other names."""
     named: Named = {}
     for name, value in sample.items():
-        kind = None if value is None else kind_of(name, value, fields, owner, single)
-        if kind is not None and isinstance(value, (list, tuple)):
+        kind = None if value is None else kind_of(name, value, fields, owner)
+        if kind is None or kind == KEEP:
+            continue
+        if isinstance(value, (list, tuple)):
             named[name] = kind, [as_tensor(item, f"{name}[{i}]", kind, owner) for i, item in enumerate(value)]
-        elif kind is not None:
+        else:
             named[name] = kind, as_tensor(value, name, kind, owner)
     if not named:
+        refuse_unknown(sample, fields, False, owner)
         raise ValueError(f"{owner}: the sample must have a field that moves; got none of {', '.join(KINDS)}")
     return named
 

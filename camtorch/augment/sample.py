@@ -17,7 +17,7 @@ from camtorch.augment.devices import remember_camera
 from camtorch.augment.fields import FRONT_ENDS, IMAGES, PLACE
 from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess, check_agrees, check_targets, refuse
-from camtorch.augment.names import check_kinds
+from camtorch.augment.names import check_kinds, refuse_unknown
 from camtorch.augment.plan import Batch, SamplePlan, form_of, form_together, move
 from camtorch.augment.reading import check_cameras, check_fields, is_batch, moving
 from camtorch.cameras.camera import Camera
@@ -251,8 +251,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         """Return what moves of a sample of a new form, checked."""
         named, owner = moving(sample, fields, self._name), self._name
         batched = not isinstance(sample, Single) and is_batch(named, camera)
-        if not batched:
-            moving(sample, fields, owner, single=True)  # raises for whole numbers of more than a row
+        refuse_unknown(sample, fields, not batched, owner)
         mode = None if predicted else self.options["mode"]
         count = check_fields(sample, named, batched, isinstance(sample, Frames), owner, mode)
         check_cameras(camera, count, named, owner)

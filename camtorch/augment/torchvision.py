@@ -21,7 +21,7 @@ from camtorch.augment.change import Change
 from camtorch.augment.fields import IMAGES, KEEP, KINDS, OWN, PLACE
 from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.matrices import Guess
-from camtorch.augment.names import kind_of, pattern_of
+from camtorch.augment.names import kind_of, refuse_unknown
 from camtorch.augment.reading import as_tensor
 from camtorch.augment.sample import Frames, Sample, detached, on_samples
 from camtorch.cameras.camera import Camera
@@ -159,24 +159,21 @@ class Transform(FrontEnd, v2.Transform):
 
     def _kinds(self, nest: _Nest) -> dict[int, str | None]:
         """Return the kind of each leaf that moves, and None for those that may be flags or orders of landmarks."""
-        fields = self.augmentation.fields
-        kinds, problems = dict[int, str | None](), dict[int, ValueError]()
-        single = all(getattr(leaf, "ndim", 0) < 4 for leaf in nest.leaves)  # images of batches have as many dims
+        fields, kinds = self.augmentation.fields, dict[int, str | None]()
         for i, (name, leaf) in enumerate(zip(nest.names, nest.leaves, strict=True)):
             is_own = name in OWN and name not in fields and name != PLACE
             if not (leaf is None or isinstance(leaf, Camera) or is_own):
-                try:
-                    kinds[i] = _kind(name, leaf, nest.paths[i], fields, single)
-                except ValueError as error:
-                    kinds[i], problems[i] = None, error
+                kinds[i] = _kind(name, leaf, nest.paths[i], fields)
+        unknown = [i for i, kind in kinds.items() if kind is None]
         if "image" not in kinds.values():
-            for i, kind in kinds.items():
-                if kind is None and _may_be_image(nest.names[i], nest.leaves[i], fields):
-                    kinds[i] = "image"
-                    problems.pop(i, None)
-                    break
-        for problem in problems.values():
-            raise problem
+            first = next((i for i in unknown if isinstance(nest.leaves[i], Tensor) and nest.leaves[i].ndim > 1), None)
+            if first is not None:
+                kinds[first] = "image"
+                unknown.remove(first)
+        single = all(getattr(leaf, "ndim", 0) < 4 for leaf in nest.leaves)  # images of batches have as many dims
+        for i in unknown:
+            refuse_unknown({nest.names[i]: _in_lists(nest.leaves[i], nest.paths[i])}, fields, single, _OWNER)
+        kinds = {i: None if kind == KEEP else kind for i, kind in kinds.items()}
         return {i: kind for i, kind in kinds.items() if kind or isinstance(nest.leaves[i], _HELD)}
 
 
@@ -216,18 +213,12 @@ def _keys(paths: list[Any], names: list[str]) -> list[str]:
     return [name if name in whole else f"{holder}/{name}" for holder, name in zip(holders, names, strict=True)]
 
 
-def _kind(name: str, leaf: Any, path: Any, fields: Mapping[str, str], single: bool) -> str | None:
-    """Return the kind of a leaf by its type, else by its name."""
+def _kind(name: str, leaf: Any, path: Any, fields: Mapping[str, str]) -> str | None:
+    """Return the kind of a leaf by its type, else by its name; see `kind_of`."""
     if isinstance(leaf, PIL.Image.Image):
         return "mask" if kind_of(name, [leaf], fields, _OWNER) == "mask" else "image"
     by_type = next((kind for of, kind in _BY_TYPE.items() if isinstance(leaf, of)), None)
-    return by_type or kind_of(name, _in_lists(leaf, path), fields, _OWNER, single)
-
-
-def _may_be_image(name: str, leaf: Any, fields: Mapping[str, str]) -> bool:
-    """Whether a leaf without a kind is a tensor whose name means nothing else."""
-    means_more = name in fields or name == PLACE or name.endswith("_valid") or pattern_of(name, fields) is not None
-    return isinstance(leaf, Tensor) and leaf.ndim > 1 and not means_more
+    return by_type or kind_of(name, _in_lists(leaf, path), fields, _OWNER)
 
 
 def _in_lists(leaf: Any, path: Any) -> Any:

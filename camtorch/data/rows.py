@@ -9,8 +9,8 @@ from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.fields import IMAGES, KEEP
-from camtorch.augment.names import kind_of
+from camtorch.augment.fields import IMAGES, KEEP, KINDS
+from camtorch.augment.names import kind_of, refuse_unknown
 from camtorch.augment.numpy import Transform, shaped_if_empty
 from camtorch.augment.part import Part
 from camtorch.augment.sample import Sample
@@ -81,10 +81,11 @@ class Mover:
             raise kind(f"{self._owner}: {which}{str(error).removeprefix(f'{self._owner}: ')}") from error
 
     def _moves(self, name: str, value: object) -> bool:
-        """Whether a value is a field that moves, or the validity of one."""
+        """Whether a value is a field that moves, or the validity of one; raise if its name does not tell."""
         if name == "camera" or value is None:
             return False
-        return name.endswith("_valid") or self._kind(name, value) is not None
+        refuse_unknown({name: value}, self._fields, False, self._owner)
+        return name.endswith("_valid") or self._kind(name, value) in KINDS
 
     def _kind(self, name: str, value: object) -> str | None:
         return kind_of(name, value, self._fields, self._owner)

@@ -24,7 +24,7 @@ from camtorch.augment.cameras import Unknown, camera_of_sample
 from camtorch.augment.fields import KINDS, PLACE
 from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.matrices import NAMES
-from camtorch.augment.names import kind_of
+from camtorch.augment.names import kind_of, refuse_unknown
 from camtorch.augment.sample import Sample, detached
 from camtorch.cameras.camera import Camera
 from camtorch.values.arguments import present
@@ -117,8 +117,9 @@ class Transform(FrontEnd, A.DualTransform):
             if target in _MAY_BE_EMPTY and len(value) == 0:
                 continue
             if name != target:
-                kind = kind_of(target, value, self.augmentation.fields, _OWNER, single=True)
-                if kind is None:
+                refuse_unknown({target: value}, self.augmentation.fields, True, _OWNER)
+                kind = kind_of(target, value, self.augmentation.fields, _OWNER)
+                if kind not in KINDS:
                     continue
                 field = f"{kind}_{i}"  # a name that begins with a kind is known
             targets[field] = name, target
@@ -150,7 +151,7 @@ class Transform(FrontEnd, A.DualTransform):
     def _is_matrix(self, name: str, value: Any) -> bool:
         name = self._additional_targets.get(name, name)
         kinds = self.augmentation.fields
-        return (name in NAMES or "K" in kinds.values()) and kind_of(name, value, kinds, _OWNER, single=True) == "K"
+        return (name in NAMES or "K" in kinds.values()) and kind_of(name, value, kinds, _OWNER) == "K"
 
 
 def _as_field(target: str, value: Any, camera: Camera) -> Any:

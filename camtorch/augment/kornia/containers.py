@@ -30,12 +30,12 @@ from torch import Tensor, nn
 
 from camtorch import augment
 from camtorch.augment.augmentation import put_crop_place
-from camtorch.augment.fields import PLACE
+from camtorch.augment.fields import KEEP, PLACE
 from camtorch.augment.front_end import FrontEnd
 from camtorch.augment.kornia.params import Params, params_of_each, with_cameras
 from camtorch.augment.kornia.private import BasicAugmentationBase
 from camtorch.augment.matrices import Guess, pinhole_of_matrix
-from camtorch.augment.names import is_text, kind_of
+from camtorch.augment.names import is_text, kind_of, refuse_unknown
 from camtorch.augment.sample import Sample, Single, detached, on_samples
 
 _NOT_MOVED = None, DataKey.CLASS, DataKey.LABEL  # the keys of fields that kornia leaves as they are
@@ -123,10 +123,11 @@ def _read_dict(container: Any, given: Sample, ours: list[FrontEnd]) -> _Dict:
     image = next((rest[name] for name, key in keys.items() if key == DataKey.INPUT), None)
     is_single = image is not None and image.ndim < 4
     option = {name: kind for one in ours for name, kind in one.augmentation.fields.items()}
+    refuse_unknown({name: rest[name] for name in unmoved}, option, is_single, owner)
     kinds = {}
     for name in unmoved:
-        kind = None if rest[name] is None else kind_of(name, rest[name], option, owner, is_single)
-        if kind is not None:
+        kind = kind_of(name, rest[name], option, owner)
+        if rest[name] is not None and kind is not None and kind != KEEP:
             kinds[name] = kind
     tables = {name for one in ours if one.augmentation.mirroring for name in one.augmentation.mirroring.by_name}
     changing = kinds.keys() | tables
