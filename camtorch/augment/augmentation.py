@@ -11,7 +11,7 @@ from torch import Tensor
 
 from camtorch.augment.cameras import known_camera
 from camtorch.augment.change import Change, by_models, check_sizes, one_or_batch
-from camtorch.augment.devices import Elsewhere, twin_of
+from camtorch.augment.devices import change_on_host, twin_of
 from camtorch.augment.fields import BOXES, FRONT_ENDS, PLACE, Named, as_corners
 from camtorch.augment.filling import scaled, tell_of_narrow_images, warn_if_empty, warn_of_unfilled, zoom_to_fill
 from camtorch.augment.matrices import Guess
@@ -228,19 +228,7 @@ class Augmentation(SampleTransform):
                 f"{self._name}: draw must be for {len(before)} samples, as the cameras; got one for "
                 f"{len(checked['apply'])}"
             )
-        return self._change_on_host(before, checked)
-
-    def _change_on_host(self, camera: Camera, draw: Draw) -> Change:
-        """Return the change of a draw, computed on the CPU also for fixed cameras elsewhere, if the draw is there."""
-        host = camera if camera.intrinsics.is_cpu else self._on_host(camera)
-        if host is camera or not all(getattr(value, "is_cpu", True) for value in draw.values()):
-            return self._change(camera, draw)
-        return Elsewhere(self._change(host, draw), camera.intrinsics.device)
-
-    def _on_host(self, camera: Camera) -> Camera:
-        """Return the camera, or its twin on the CPU if new cameras follow from the numbers alone."""
-        twin = twin_of(camera) if self.drawn_on_host else None
-        return camera if twin is None else twin
+        return change_on_host(before, checked, self._change, self.drawn_on_host)
 
     def _change(self, camera: Camera, draw: Draw) -> Change:
         """Return the change of a draw of any form."""
@@ -299,7 +287,7 @@ class Augmentation(SampleTransform):
         """Warn, once, if new images of `camera` will be mostly empty; draws from a generator of its own show it."""
         if self.min_filled is not None or self._calls.has_looked or self.p == 0 or self.crops:
             return  # `crops` need boxes, which say what is intended
-        camera = self._on_host(camera)
+        camera = (twin_of(camera) if self.drawn_on_host else None) or camera
         camera = camera[0] if camera.is_mixed else camera
         if not are_concrete(camera.intrinsics):
             return
@@ -356,7 +344,8 @@ class Augmentation(SampleTransform):
         plan, camera, count = batch.plan, batch.camera, batch.plan.count
         if draw is None:
             drawn = self._draw_numbers(count, self.p, self.same_on_batch, generator)
-            change = self._change_on_host(camera, self._with_labels(drawn, batch.rows))
+            drawn = self._with_labels(drawn, batch.rows)
+            change = change_on_host(camera, drawn, self._change, self.drawn_on_host)
         else:
             change = self.change(camera, self._with_labels(draw, batch.rows))
         if change.count != count:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from camtorch.augment.change import Change, TensorOrPair, as_is
 from camtorch.augment.part import Part
+from camtorch.augment.ranges import Draw
 from camtorch.cameras.camera import Camera
 from camtorch.cameras.mixed import Mixed
 from camtorch.evaluate.devices import may_read, on_cpu, remember, sent
@@ -53,6 +54,17 @@ def remember_camera(camera: Camera, twin: Camera) -> None:
     for there, here in zip(camera.tensors, twin.tensors, strict=True):
         for shape in {there.shape, (*camera.batch_shape, there.shape[-1])}:  # also as calls expand it
             remember(there.expand(shape), here.expand(shape))
+
+
+def change_on_host(camera: Camera, draw: Draw, make: Callable[[Camera, Draw], Change], may: bool) -> Change:
+    """Return `make(camera, draw)`, computed on the CPU also for a fixed camera elsewhere, if the draw is there.
+
+    may: whether new cameras follow from the numbers of cameras alone.
+    """
+    twin = None if camera.intrinsics.is_cpu or not may else twin_of(camera)
+    if twin is None or not all(getattr(value, "is_cpu", True) for value in draw.values()):
+        return make(camera, draw)
+    return Elsewhere(make(twin, draw), camera.intrinsics.device)
 
 
 class Elsewhere(Change):
