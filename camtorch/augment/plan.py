@@ -109,7 +109,7 @@ class Batch(NamedTuple):
     plan: SamplePlan
     values: Mapping[str, Any]  # as they came, where these are tensors; without a dim B if the plan is not `batched`
     camera: Camera
-    must_check: bool  # whether values are to be checked as they move: they were not, and come from no network
+    checked: bool  # whether values need no check as they move: they had it, or come from a network
 
     def rows(self) -> Named:
         """Return name -> kind and value, with a dim B."""
@@ -191,7 +191,7 @@ class Batch(NamedTuple):
             flags = [valid.squeeze(0) for _, valid in pairs if valid is not None]
             return [rows.squeeze(0) for rows, _ in pairs], flags or None
         check = KINDS[kind].check
-        if self.must_check and check is not None:
+        if check is not None and not self.checked:
             check(value, name, owner)
         rows, valid = move(change, kind, value if batched else value.unsqueeze(0), options)
         return (rows, valid) if batched else (rows.squeeze(0), None if valid is None else valid.squeeze(0))

@@ -39,40 +39,46 @@ def moving(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str) -> 
     return named
 
 
-def check_fields(
-    sample: Mapping[str, Any], named: Named, batched: bool, has_frames: bool, owner: str, mode: str | None
-) -> int:
-    """Raise if the shape or the values of a field are wrong; return the number of samples.
+def check_shapes(named: Named, batched: bool, has_frames: bool, owner: str) -> int:
+    """Raise if the shape of a field is wrong; return the number of samples.
 
-    has_frames: whether values of a single sample may have leading dims. mode: how images are sampled; None if values
-    come from a network, and are not checked.
+    has_frames: whether values of a single sample may have leading dims.
     """
-    images = [value for kind, value in named.values() if kind == "image"]
-    size = images[0][0].shape[-2:] if images and len(images[0]) else ()
     count = -1
     for name, (kind, value) in named.items():
-        several, field = isinstance(value, list), KINDS[kind]
-        for i, item in enumerate(value if several else [value]):
-            which = f"{name}[{i}]" if several else name
-            more = item.ndim - field.most_dims
+        several = isinstance(value, list)
+        for which, item in _items(name, value):
+            more = item.ndim - KINDS[kind].most_dims
             frame = item.new_empty(item.shape[more:]) if more > 0 and has_frames else item
             check_shape(kind, which, frame, batched and not several, owner)
-            if mode is None:
-                continue
-            if field.check is not None:
-                field.check(item, which, owner)
-            if kind == "image":
-                check_averaged(item, mode, which, owner)
-            if len(size) == 2:
-                flags = sample.get(f"{name}_valid")
-                if several and flags is not None:
-                    flags = flags[i] if i < len(flags) else ()
-                warn_of_numbers(kind, which, item, flags, size, owner)
         rows = len(value) if batched or several else 1
         count = rows if count < 0 else count
         if rows != count:
             raise ValueError(f"{owner}: {name} must be of {count} samples, as other fields; got {rows}")
     return count
+
+
+def check_values(sample: Mapping[str, Any], named: Named, mode: str, owner: str) -> None:
+    """Raise if the values of a field are wrong, and warn if they seem to be; mode: how images are sampled."""
+    images = [value for kind, value in named.values() if kind == "image"]
+    size = images[0][0].shape[-2:] if images and len(images[0]) else ()
+    for name, (kind, value) in named.items():
+        given, check = sample.get(f"{name}_valid"), KINDS[kind].check
+        for i, (which, item) in enumerate(_items(name, value)):
+            if check is not None:
+                check(item, which, owner)
+            if kind == "image":
+                check_averaged(item, mode, which, owner)
+            if len(size) == 2:
+                flags = given
+                if isinstance(value, list) and given is not None:
+                    flags = given[i] if i < len(given) else ()
+                warn_of_numbers(kind, which, item, flags, size, owner)
+
+
+def _items(name: str, value: Any) -> list[tuple[str, Tensor]]:
+    """Return the tensors of a field, with their names in errors: one, or those of a list."""
+    return [(f"{name}[{i}]", item) for i, item in enumerate(value)] if isinstance(value, list) else [(name, value)]
 
 
 def check_cameras(camera: object, count: int, named: Named, owner: str) -> None:

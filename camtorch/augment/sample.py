@@ -19,7 +19,7 @@ from camtorch.augment.landmarks import Mirroring
 from camtorch.augment.matrices import Guess, check_agrees, check_targets, refuse
 from camtorch.augment.names import check_kinds, refuse_unknown
 from camtorch.augment.plan import Batch, SamplePlan, form_of, form_together, move
-from camtorch.augment.reading import check_cameras, check_fields, is_batch, moving
+from camtorch.augment.reading import check_cameras, check_shapes, check_values, is_batch, moving
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept
@@ -236,7 +236,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         plan = None if form is None else self._calls.plans.get((), form)
         if plan is not None:
             camera = one_or_batch(camera) if camera.intrinsics.ndim > 1 else camera
-            batch = Batch(plan, sample, camera, must_check=not predicted)
+            batch = Batch(plan, sample, camera, checked=predicted)
         else:
             batch = self._new_batch(sample, camera, fields, predicted)
             # a plan reads values from the sample, so none may have been converted
@@ -252,8 +252,9 @@ class SampleTransform(KeepsCamera, nn.Module):
         named, owner = moving(sample, fields, self._name), self._name
         batched = not isinstance(sample, Single) and is_batch(named, camera)
         refuse_unknown(sample, fields, not batched, owner)
-        mode = None if predicted else self.options["mode"]
-        count = check_fields(sample, named, batched, isinstance(sample, Frames), owner, mode)
+        count = check_shapes(named, batched, isinstance(sample, Frames), owner)
+        if not predicted:
+            check_values(sample, named, self.options["mode"], owner)
         check_cameras(camera, count, named, owner)
         tensors = {
             name: t for name, (_, value) in named.items() for t in (value if isinstance(value, list) else [value])
@@ -273,7 +274,7 @@ class SampleTransform(KeepsCamera, nn.Module):
         form = form_together(named, batched, masks, self.mask_fill)
         matrices = [name for name, kind in kinds.items() if kind == "K"]
         plan = SamplePlan(kinds, batched, count, matrices, masks, self.mask_fill, form)
-        return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, must_check=False)
+        return Batch(plan, {name: value for name, (_, value) in named.items()}, camera, checked=True)
 
     def _check_matrices(self, batch: Batch, sample: Sample) -> None:
         """Raise a ValueError if fields K are not the camera of a batch, or cannot be the new one's."""
