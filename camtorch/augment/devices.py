@@ -105,13 +105,13 @@ class Elsewhere(Change):
         return self._inverse
 
 
-def _remade(parts: Sequence[Part], change: Callable[[list[Tensor]], list[Tensor]]) -> list[Part]:
-    """Return parts with all their numbers changed by one call of `change`; `twin_of` finds the cameras before."""
+def _remade(parts: Sequence[Part], converted: Callable[[list[Tensor]], list[Tensor]]) -> list[Part]:
+    """Return parts with all their numbers converted by one call; `twin_of` finds the cameras before."""
     given: list[Tensor] = []
     for part in parts:
         given += [t for camera in _cameras(part) for t in camera.tensors]
         given += [t for t in (part.rotation, part.light) if t is not None]
-    numbers = iter(change(given))
+    numbers = iter(converted(given))
 
     # takes the next numbers, in the order in which `given` lists them
     def remade_as(camera: Camera) -> Camera:

@@ -109,10 +109,10 @@ class Part:
         """(height, width) after the change."""
         return self.camera.size_for("Warp") if self.motion is None else self.motion.image_size
 
-    def with_warps(self, change: Callable[[Warp], Warp]) -> Part:
-        """Return the part with each of its warps changed."""
-        shades = None if self.shades is None else (change(self.shades[0]), change(self.shades[1]))
-        return replace(self, motion=None if self.motion is None else change(self.warp), shades=shades)
+    def with_warps(self, other: Callable[[Warp], Warp]) -> Part:
+        """Return the part with another warp for each of its own: `other(warp)`."""
+        shades = None if self.shades is None else (other(self.shades[0]), other(self.shades[1]))
+        return replace(self, motion=None if self.motion is None else other(self.warp), shades=shades)
 
     def with_options(self, options: Options) -> Part:
         """Return the part with its warps made anew by other options."""
