@@ -52,7 +52,7 @@ def kind_of(name: str, value: object, fields: Mapping[str, str], owner: str) -> 
     return kind
 
 
-def refuse_unknown(sample: Mapping[str, Any], fields: Mapping[str, str], single: bool, owner: str) -> None:
+def refuse_unknown(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str, *, single: bool) -> None:
     """Raise a ValueError if a field of unknown name may be geometry.
 
     fields: name -> kind, of other names. single: whether the sample is known to be without a dim B.

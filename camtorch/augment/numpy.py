@@ -159,7 +159,7 @@ class Transform(FrontEnd):
 
     def _new_ways(self, sample: Sample, camera: Any) -> dict[str, Way]:
         """Return the way of each field, which its form alone decides: of images, of one, of numbers, or of all else."""
-        refuse_unknown(sample, self.augmentation.fields, True, _OWNER)
+        refuse_unknown(sample, self.augmentation.fields, _OWNER, single=True)
         ways, mirroring = dict[str, Way](), self.augmentation.mirroring
         size = getattr(self.augmentation.camera if camera is None else camera, "image_size", None)
         for name, value in sample.items():

@@ -23,7 +23,11 @@ _RANKS = {kind: (not field.tells_batches, i) for i, (kind, field) in enumerate(K
 
 
 def moving(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str) -> Named:
-    """Return the fields that move, at least one; fields: name -> kind, of other names."""
+    """Return the fields that move, at least one; fields: name -> kind, of other names.
+
+    Raises a ValueError for a field of unknown name that may be geometry, with a dim B or without it.
+    """
+    refuse_unknown(sample, fields, owner, single=False)
     named: Named = {}
     for name, value in sample.items():
         kind = None if value is None else kind_of(name, value, fields, owner)
@@ -34,7 +38,6 @@ def moving(sample: Mapping[str, Any], fields: Mapping[str, str], owner: str) -> 
         else:
             named[name] = kind, as_tensor(value, name, kind, owner)
     if not named:
-        refuse_unknown(sample, fields, False, owner)
         raise ValueError(f"{owner}: the sample must have a field that moves; got none of {', '.join(KINDS)}")
     return named
 

@@ -251,7 +251,8 @@ class SampleTransform(KeepsCamera, nn.Module):
         """Return what moves of a sample of a new form, checked."""
         named, owner = moving(sample, fields, self._name), self._name
         batched = not isinstance(sample, Single) and is_batch(named, camera)
-        refuse_unknown(sample, fields, not batched, owner)
+        if not batched:
+            refuse_unknown(sample, fields, owner, single=True)
         count = check_shapes(named, batched, isinstance(sample, Frames), owner)
         if not predicted:
             check_values(sample, named, self.options["mode"], owner)

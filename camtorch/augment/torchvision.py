@@ -172,7 +172,8 @@ class Transform(FrontEnd, v2.Transform):
                 unknown.remove(first)
         single = all(getattr(leaf, "ndim", 0) < 4 for leaf in nest.leaves)  # images of batches have as many dims
         for i in unknown:
-            refuse_unknown({nest.names[i]: _in_lists(nest.leaves[i], nest.paths[i])}, fields, single, _OWNER)
+            leaf = _in_lists(nest.leaves[i], nest.paths[i])
+            refuse_unknown({nest.names[i]: leaf}, fields, _OWNER, single=single)
         kinds = {i: None if kind == KEEP else kind for i, kind in kinds.items()}
         return {i: kind for i, kind in kinds.items() if kind or isinstance(nest.leaves[i], _HELD)}
 

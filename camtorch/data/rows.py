@@ -84,7 +84,7 @@ class Mover:
         """Whether a value is a field that moves, or the validity of one; raise if its name does not tell."""
         if name == "camera" or value is None:
             return False
-        refuse_unknown({name: value}, self._fields, False, self._owner)
+        refuse_unknown({name: value}, self._fields, self._owner, single=False)
         return name.endswith("_valid") or self._kind(name, value) in KINDS
 
     def _kind(self, name: str, value: object) -> str | None:

@@ -117,7 +117,7 @@ class Transform(FrontEnd, A.DualTransform):
             if target in _MAY_BE_EMPTY and len(value) == 0:
                 continue
             if name != target:
-                refuse_unknown({target: value}, self.augmentation.fields, True, _OWNER)
+                refuse_unknown({target: value}, self.augmentation.fields, _OWNER, single=True)
                 kind = kind_of(target, value, self.augmentation.fields, _OWNER)
                 if kind not in KINDS:
                     continue

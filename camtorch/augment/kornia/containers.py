@@ -123,7 +123,7 @@ def _read_dict(container: Any, given: Sample, ours: list[FrontEnd]) -> _Dict:
     image = next((rest[name] for name, key in keys.items() if key == DataKey.INPUT), None)
     is_single = image is not None and image.ndim < 4
     option = {name: kind for one in ours for name, kind in one.augmentation.fields.items()}
-    refuse_unknown({name: rest[name] for name in unmoved}, option, is_single, owner)
+    refuse_unknown({name: rest[name] for name in unmoved}, option, owner, single=is_single)
     kinds = {}
     for name in unmoved:
         kind = kind_of(name, rest[name], option, owner)
