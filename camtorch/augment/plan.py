@@ -198,14 +198,21 @@ class Batch(NamedTuple):
 
 
 def move(change: Change, kind: str, value: Tensor, options: Mapping[str, float]) -> MovedField:
-    """Return values (B, ...) of a kind moved by a change; those of one sample may have more dims, of frames."""
-    lead = value.shape[1 : value.ndim - KINDS[kind].most_dims]
-    if lead:
-        frames = change._with_parts([replace(part, rows=None) for part in change.parts], [0] * math.prod(lead))
-        result, valid = move(frames, kind, value.flatten(0, len(lead)), options)
-        valid = None if valid is None else valid.reshape(1, *lead, *valid.shape[1:])
-        return result.reshape(1, *lead, *result.shape[1:]), valid
+    """Return values (B, ...) of a kind moved by a change, and which are valid, if any; see also `_move_frames`."""
+    dims = value.ndim - 1 - KINDS[kind].most_dims
+    if dims > 0:
+        return _move_frames(change, kind, value, dims, options)
     result = KINDS[kind].move(change, value, options)
     result, valid = result if isinstance(result, tuple) else (result, None)
     # geometry is computed in float32 at least; what came in half precision goes out in it
     return in_range(result, value.dtype) if value.dtype.is_floating_point else result, valid
+
+
+def _move_frames(change: Change, kind: str, value: Tensor, dims: int, options: Mapping[str, float]) -> MovedField:
+    """Return values (1, *frames, ...) of one sample, with `dims` dims of frames: its change moves each of them."""
+    frames = value.shape[1 : 1 + dims]
+    parts = [replace(part, rows=None) for part in change.parts]
+    of_frames = change._with_parts(parts, samples=[0] * math.prod(frames))
+    result, valid = move(of_frames, kind, value.flatten(0, dims), options)
+    valid = None if valid is None else valid.reshape(1, *frames, *valid.shape[1:])
+    return result.reshape(1, *frames, *result.shape[1:]), valid

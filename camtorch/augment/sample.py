@@ -239,10 +239,11 @@ class SampleTransform(KeepsCamera, nn.Module):
             batch = Batch(plan, sample, camera, checked=predicted)
         else:
             batch = self._new_batch(sample, camera, fields, predicted)
-            # a plan reads values from the sample, so none may have been converted
-            are_as_given = all(value is sample[name] for name, value in batch.values.items())
-            if form is not None and are_as_given and batch.camera.intrinsics.device == camera.intrinsics.device:
-                self._calls.plans((), form, lambda: batch.plan)
+            if form is not None:
+                converted = [name for name, value in batch.values.items() if value is not sample[name]]
+                is_sent = batch.camera.intrinsics.device != camera.intrinsics.device
+                if not converted and not is_sent:  # a plan does neither for the next sample
+                    self._calls.plans((), form, lambda: batch.plan)
         if batch.plan.matrices:
             self._check_matrices(batch, sample)
         return batch
