@@ -65,23 +65,22 @@ def camera_of_images(named: Named, guess: Guess | None, is_needed: bool, owner: 
 
 def camera_of_sample(
     owner: str,
-    given: object,
-    own: object,
+    known: object,
     is_needed: bool,
     sizes: Sequence[tuple[str, tuple[int, ...]]],
     matrix: tuple[str, Any] | None = None,
 ) -> Camera:
     """Return the single camera of a sample of a front end.
 
-    given: the camera of the sample, else of the front end. own: that of the augmentation. is_needed: whether this one
-    needs a camera. sizes: names and sizes (height, width) of images. matrix: name and value of a field K.
+    known: what `known_camera` returns. is_needed: whether the augmentation needs a camera. sizes: names and sizes
+    (height, width) of images. matrix: name and value of a field K.
     """
-    camera = known_camera(given, own)
-    is_told = not (camera is None and matrix is None and is_needed)
-    if sizes and is_told and (camera is None or isinstance(camera, Guess)):
+    camera = known
+    is_told = known is not None or matrix is not None or not is_needed
+    if sizes and is_told and (known is None or isinstance(known, Guess)):
         height, width = sizes[0][1]
         rows = None if matrix is None else (matrix[0], as_tensor(matrix[1], matrix[0], "K", owner))
-        camera = _stand_in((height, width), rows, camera, owner)
+        camera = _stand_in((height, width), rows, known, owner)
     if not isinstance(camera, Camera):
         how = "give one here, in the sample, or to the augmentation"
         raise ValueError(f"{owner}: camera must be a Camera; got {shown(camera)}. Please {how}. {GUESS_CAMERA}")

@@ -120,12 +120,12 @@ class Transform(FrontEnd, v2.Transform):
         for name, count in (("camera", len(cameras)), (PLACE, nest.names.count(PLACE))):
             if count > 1:
                 raise ValueError(f"{_OWNER}: a sample must have one {name}; got {count}")
-        known = leaves[cameras[0]] if cameras else self.camera
+        known = known_camera(leaves[cameras[0]] if cameras else self.camera, augmentation.camera)
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
         camera = detached(self._camera_of(nest, fields, known))
         sample = Frames({keys[i]: field.value for i, field in fields.items()}, camera=camera)
         kinds = {keys[i]: field.kind or KEEP for i, field in fields.items()}
-        is_guessed = isinstance(known_camera(known, augmentation.camera), Guess) and "K" not in kinds.values()
+        is_guessed = isinstance(known, Guess) and "K" not in kinds.values()
         added = [name for name in (PLACE, "rotation") if augmentation.place and name not in sample]
         if is_guessed or (augmentation.place and not cameras):
             added.append("camera")
@@ -147,15 +147,15 @@ class Transform(FrontEnd, v2.Transform):
 
         return sample, kinds, write
 
-    def _camera_of(self, nest: _Nest, fields: Mapping[int, _Leaf], known: Camera | float | None) -> Camera:
-        """Return the camera of a sample's images; known: that of the sample, else of this transform."""
-        own, sizes = self.augmentation, []
+    def _camera_of(self, nest: _Nest, fields: Mapping[int, _Leaf], known: object) -> Camera:
+        """Return the camera of a sample's images; known: what `known_camera` returns."""
+        sizes = []
         for i, field in fields.items():
             size = field.value.shape[-2:] if field.kind in IMAGES else getattr(nest.leaves[i], "canvas_size", None)
             if size is not None:
                 sizes.append((type(nest.leaves[i]).__name__, tuple(size)))
         matrix = next(((nest.keys[i], field.value) for i, field in fields.items() if field.kind == "K"), None)
-        return camera_of_sample(_OWNER, known, own.camera, own.needs_camera, sizes, matrix)
+        return camera_of_sample(_OWNER, known, self.augmentation.needs_camera, sizes, matrix)
 
     def _kinds(self, nest: _Nest) -> dict[int, str | None]:
         """Return the kind of each leaf that moves, and None for those that may be flags or orders of landmarks."""

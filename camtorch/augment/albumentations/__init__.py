@@ -20,7 +20,7 @@ from albumentations.core.type_definitions import Targets
 from camtorch.augment import numpy as arrays
 from camtorch.augment.albumentations.saving import as_plain, from_plain
 from camtorch.augment.augmentation import Augmentation
-from camtorch.augment.cameras import Unknown, camera_of_sample
+from camtorch.augment.cameras import Unknown, camera_of_sample, known_camera
 from camtorch.augment.fields import KINDS, PLACE
 from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.matrices import NAMES
@@ -143,10 +143,10 @@ class Transform(FrontEnd, A.DualTransform):
         sizes = [(name, np.shape(data[name])[:2]) for name in ("image", "mask") if data.get(name) is not None]
         several = [name for name in ("images", "masks") if data.get(name) is not None and len(data[name])]
         sizes += [(name, np.shape(data[name][0])[:2]) for name in several]
-        known = self.camera if data.get("camera") is None else data["camera"]
+        given, own = data.get("camera"), self.augmentation
+        known = known_camera(self.camera if given is None else given, own.camera)
         matrix = next((pair for pair in data.items() if pair[1] is not None and self._is_matrix(*pair)), None)
-        own = self.augmentation
-        return camera_of_sample(_OWNER, known, own.camera, own.needs_camera, sizes, matrix)
+        return camera_of_sample(_OWNER, known, own.needs_camera, sizes, matrix)
 
     def _is_matrix(self, name: str, value: Any) -> bool:
         name = self._additional_targets.get(name, name)
