@@ -18,7 +18,7 @@ from torch import Tensor
 
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.face import FaceNormalizer
-from camtorch.augment.fields import IMAGES, KINDS, PLACE
+from camtorch.augment.fields import IMAGES, KEEP, KINDS, PLACE
 from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.names import ALIASES, kind_of, refuse_unknown
 from camtorch.augment.sample import Sample, Single
@@ -139,14 +139,14 @@ class Transform(FrontEnd):
         return tensors, write
 
     def _kind(self, name: str, value: Any, sample: Mapping[str, Any]) -> str | None:
-        """Return the kind of a field, or of the field whose validity it is; None if it is not moved."""
+        """Return the kind of a field, or of the field whose validity it is; see `kind_of`."""
         kind = kind_of(name, value, self.augmentation.fields, _OWNER)
         if kind not in KINDS and name.endswith(_VALID):
             name = name.removesuffix(_VALID)
             kind = kind_of(name, sample.get(name), self.augmentation.fields, _OWNER)
             if kind in IMAGES and np.ndim(value) <= 1:  # a flag for each sample
-                return None
-        return kind if kind in KINDS else None
+                return KEEP
+        return kind
 
     def _ways(self, sample: Sample, camera: Any) -> dict[str, Way]:
         """Return the way of each field, which are kept by the form of the sample."""
@@ -168,7 +168,7 @@ class Transform(FrontEnd):
                 ways[name] = _way_of_images(name, value, size, kind)
             elif kind in IMAGES:
                 ways[name] = _way_of_image(name, value, size)
-            elif kind is not None or (mirroring is not None and name in mirroring.by_name):
+            elif kind in KINDS or (mirroring is not None and name in mirroring.by_name):
                 ways[name] = _way_of_numbers(name, value, kind)
             else:
                 ways[name] = _way_of_others(name)
@@ -180,8 +180,8 @@ def _way_of_others(name: str) -> Way:
 
 
 def _way_of_numbers(name: str, value: Any, kind: str | None) -> Way:
-    """Return the way of labels, of flags, and of orders of landmarks, whose kind is None."""
-    if kind is not None and _is_shared(name, value) and value.dtype.kind == "f":
+    """Return the way of labels, of flags, and of orders of landmarks, which have no kind."""
+    if kind in KINDS and _is_shared(name, value) and value.dtype.kind == "f":
         return Way(lambda given: {name: torch.from_numpy(given)}, lambda moved, given: moved[name].numpy())
 
     def read(given: Any) -> Sample:
@@ -265,7 +265,7 @@ def shaped_if_empty(array: Any, kind: str | None) -> Any:
 
 def _numbers(value: Any, name: str, kind: str | None) -> Any:
     """Return coordinates as floating point, flags as bool, and a list of numbers as an array."""
-    if kind is None or name.endswith(_VALID):
+    if kind not in KINDS or name.endswith(_VALID):
         return np.asarray(value, bool if name.endswith(_VALID) else None)
     if isinstance(value, (list, tuple)):
         with contextlib.suppress(TypeError, ValueError):

@@ -124,7 +124,7 @@ class Transform(FrontEnd, v2.Transform):
         # a graph of the camera would make the warp slower, and could not leave a DataLoader's worker
         camera = detached(self._camera_of(nest, fields, known))
         sample = Frames({keys[i]: field.value for i, field in fields.items()}, camera=camera)
-        kinds = {keys[i]: field.kind or KEEP for i, field in fields.items()}
+        kinds = {keys[i]: field.kind for i, field in fields.items()}
         is_guessed = isinstance(known, Guess) and "K" not in kinds.values()
         added = [name for name in (PLACE, "rotation") if augmentation.place and name not in sample]
         if is_guessed or (augmentation.place and not cameras):
@@ -133,7 +133,7 @@ class Transform(FrontEnd, v2.Transform):
         def write(moved: Sample, change: Change) -> Any:
             part = change.parts[0]
             for i, field in fields.items():  # where nothing moves, PIL images and tv_tensors stay as they are
-                if part.motion is not None or not field.kind or type(leaves[i]) in _HELD:
+                if part.motion is not None or field.kind == KEEP or type(leaves[i]) in _HELD:
                     leaves[i] = field.write(moved[keys[i]], part.image_size)
             for i in cameras:
                 leaves[i] = moved["camera"]
@@ -157,8 +157,8 @@ class Transform(FrontEnd, v2.Transform):
         matrix = next(((nest.keys[i], field.value) for i, field in fields.items() if field.kind == "K"), None)
         return camera_of_sample(_OWNER, known, self.augmentation.needs_camera, sizes, matrix)
 
-    def _kinds(self, nest: _Nest) -> dict[int, str | None]:
-        """Return the kind of each leaf that moves, and None for those that may be flags or orders of landmarks."""
+    def _kinds(self, nest: _Nest) -> dict[int, str]:
+        """Return the kind of each leaf that moves, and `KEEP` for those that may be flags or orders of landmarks."""
         fields, kinds = self.augmentation.fields, dict[int, str | None]()
         for i, (name, leaf) in enumerate(zip(nest.names, nest.leaves, strict=True)):
             is_own = name in OWN and name not in fields and name != PLACE
@@ -174,8 +174,7 @@ class Transform(FrontEnd, v2.Transform):
         for i in unknown:
             leaf = _in_lists(nest.leaves[i], nest.paths[i])
             refuse_unknown({nest.names[i]: leaf}, fields, _OWNER, single=single)
-        kinds = {i: None if kind == KEEP else kind for i, kind in kinds.items()}
-        return {i: kind for i, kind in kinds.items() if kind or isinstance(nest.leaves[i], _HELD)}
+        return {i: kind or KEEP for i, kind in kinds.items() if kind in KINDS or isinstance(nest.leaves[i], _HELD)}
 
 
 class _Nest:
@@ -236,20 +235,20 @@ def _in_lists(leaf: Any, path: Any) -> Any:
 class _Leaf(NamedTuple):
     """A leaf of a nest that may move."""
 
-    kind: str | None  # None: it may be a flag or an order of landmarks
+    kind: str  # KEEP: it may be a flag or an order of landmarks
     value: Any  # as the augmentation takes it
     write: Callable[[Any, tuple[int, int]], Any]  # (moved value, size of the new image) -> leaf like the given one
 
 
-def _read_leaf(name: str, leaf: Any, kind: str | None) -> _Leaf:
+def _read_leaf(name: str, leaf: Any, kind: str) -> _Leaf:
     """Read an image of PIL or numpy, another array, a flag or an order, a tensor, points, or boxes, in this order."""
     if not isinstance(leaf, Tensor) and kind in IMAGES:
         planes, restored = as_planes_of(leaf, name, _OWNER)
         return _Leaf(kind, planes, lambda moved, size: restored(moved))
     if not isinstance(leaf, Tensor):
-        value = as_tensor(leaf, name, kind, _OWNER) if kind else leaf
+        value = leaf if kind == KEEP else as_tensor(leaf, name, kind, _OWNER)
         return _Leaf(kind, value, lambda moved, size: np.asarray(moved))
-    if not kind:
+    if kind == KEEP:
         return _Leaf(kind, leaf, lambda moved, size: moved)
     lacking = KINDS[kind].dims - leaf.ndim  # of a single point, box or plane
     rows: Tensor = leaf.as_subclass(Tensor)[(None,) * lacking]
