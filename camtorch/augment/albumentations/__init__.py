@@ -118,7 +118,7 @@ class Transform(FrontEnd, A.DualTransform):
                 continue
             if name != target:
                 refuse_unknown({target: value}, self.augmentation.fields, _OWNER, single=True)
-                kind = kind_of(target, value, self.augmentation.fields, _OWNER)
+                kind = self._kind(name, value)
                 if kind not in KINDS:
                     continue
                 field = f"{kind}_{i}"  # a name that begins with a kind is known
@@ -145,13 +145,13 @@ class Transform(FrontEnd, A.DualTransform):
         sizes += [(name, np.shape(data[name][0])[:2]) for name in several]
         given, own = data.get("camera"), self.augmentation
         known = known_camera(self.camera if given is None else given, own.camera)
-        matrix = next((pair for pair in data.items() if pair[1] is not None and self._is_matrix(*pair)), None)
+        named = [(name, value) for name, value in data.items() if value is not None]
+        matrix = next((pair for pair in named if self._kind(*pair) == "K"), None)
         return camera_of_sample(_OWNER, known, own.needs_camera, sizes, matrix)
 
-    def _is_matrix(self, name: str, value: Any) -> bool:
-        name = self._additional_targets.get(name, name)
-        kinds = self.augmentation.fields
-        return (name in NAMES or "K" in kinds.values()) and kind_of(name, value, kinds, _OWNER) == "K"
+    def _kind(self, name: str, value: Any) -> str | None:
+        """Return the kind of a field, by its name or by that of its target; see `kind_of`."""
+        return kind_of(self._additional_targets.get(name, name), value, self.augmentation.fields, _OWNER)
 
 
 def _as_field(target: str, value: Any, camera: Camera) -> Any:
