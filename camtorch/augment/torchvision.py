@@ -18,7 +18,7 @@ from torch import Tensor
 from camtorch.augment.augmentation import Augmentation
 from camtorch.augment.cameras import camera_of_sample, known_camera
 from camtorch.augment.change import Change
-from camtorch.augment.fields import IMAGES, KEEP, KINDS, OWN, PLACE
+from camtorch.augment.fields import IMAGES, KEEP, KINDS, PLACE
 from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.matrices import Guess
 from camtorch.augment.names import kind_of, refuse_unknown
@@ -161,8 +161,7 @@ class Transform(FrontEnd, v2.Transform):
         """Return the kind of each leaf that moves, and `KEEP` for those that may be flags or orders of landmarks."""
         fields, kinds = self.augmentation.fields, dict[int, str | None]()
         for i, (name, leaf) in enumerate(zip(nest.names, nest.leaves, strict=True)):
-            is_own = name in OWN and name not in fields and name != PLACE
-            if not (leaf is None or isinstance(leaf, Camera) or is_own):
+            if not (leaf is None or isinstance(leaf, Camera) or name == "camera"):
                 kinds[i] = _kind(name, leaf, nest.paths[i], fields)
         unknown = [i for i, kind in kinds.items() if kind is None]
         if "image" not in kinds.values():
