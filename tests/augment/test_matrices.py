@@ -175,6 +175,17 @@ def test_who_wins():
     assert torch.equal(kept["K"], fields["K"])
 
 
+@pytest.mark.parametrize("count", [3, [1, 2, 3], torch.tensor([1, 2, 3]), "K.txt"], ids=str)
+def test_numbers_of_things_may_be_named_as_a_matrix(count):
+    camera = ct.Pinhole([120.0, 124, 61, 46], image_size=SIZE)
+    mount, image = A.RandomMount(camera=camera), torch.rand(3, *SIZE)
+    array = count.numpy() if isinstance(count, torch.Tensor) else count
+    for name in ("K", "intrinsics"):
+        assert mount({"image": image, name: count})[name] is count
+        assert mount({"image": image.expand(3, -1, -1, -1), name: count})[name] is count
+        assert A.numpy.Transform(mount)({"image": image[0].numpy(), name: array})[name] is array
+
+
 class Lens(A.Augmentation):
     def new_camera(self, source, values):
         return ct.KannalaBrandt(source.intrinsics, torch.zeros(4), image_size=source.image_size), None
