@@ -166,17 +166,18 @@ class CameraDrawer(Augmentation):
         values = values_for(source, draw)
         # a draw is of tensors where something is recorded
         start = None if isinstance(draw["apply"], Tensor) else self._start(source, values)
-        if start is None:
+        options = self.options
+        made = None if start is None else start.warp(source, values, options)
+        if made is None:
             target, rotation = self._filled_camera(source, values)
         else:
-            options = self.options
-            made, zooms, filled = start.warp(source, values, options)
+            warp, zooms, filled = made
             if self.min_filled and (min(filled, default=1) < self.min_filled or max(zooms, default=1) > 1):
-                self._tell_of_unfilled(source, lambda: made.target, torch.tensor([*zooms]), torch.tensor([*filled]))
-            may_stay_lazy = made.natives is not None and options["tolerance"] and not options["antialias"]
+                self._tell_of_unfilled(source, lambda: warp.target, torch.tensor([*zooms]), torch.tensor([*filled]))
+            may_stay_lazy = warp.natives is not None and options["tolerance"] and not options["antialias"]
             if may_stay_lazy and self.beside_the_camera.isdisjoint(self.ranges):
-                return Part(source, made)  # of numbers, which become a `Warp` at first use
-            target, rotation = made.target, made.rotation
+                return Part(source, warp)  # of numbers, which become a `Warp` at first use
+            target, rotation = warp.target, warp.rotation
         return self._seen_by(source, target, rotation, values)
 
     def _seen_by(self, source: Camera, target: Camera, rotation: Tensor | None, values: Mapping[str, Any]) -> Part:

@@ -4,7 +4,7 @@ A `Start` is made once for the cameras that draws start from, and has what all d
 `native/draws.h`, which describes its fields, and both cameras for native code. `Start.warp` is a draw: it gives C the
 drawn numbers and memory, and returns the numbers of the new cameras, which C wrote there. New cameras have the lens of
 the base, or, if coefficients are drawn, lenses that C makes. Where C cannot make these, as it cannot compute where they
-end, `Start.of` returns None.
+end, `Start.of` returns None; and `Start.warp` where C, which does not ask, took coefficients without a formula.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Start:
             return None
         if {t.dtype for t in source.tensors} != {base.intrinsics.dtype}:
             return None
-        if wanted.nominal is not None and not _can_make_lenses(base, of_base.native):
+        if wanted.nominal is not None and not _can_make_lenses(of_base.native):
             return None
         return cls(wanted, of_source.native, of_base.native)
 
@@ -118,6 +118,7 @@ class Start:
         self._number = "f4" if base_native.dtype == torch.float32 else "f8"
         self._distortion = base.distortion.detach().numpy()
         self._rest = self._limits = 0  # how many numbers a new lens has besides coefficients, and of limits of azimuths
+        self._may_lack_formula = wanted.nominal is not None and not base.always_defined
         base_native.add_table()  # new cameras of its lens have it too, for those that unproject
         start = self._struct = structs.Start(count=base.distortion.shape[-1], is_each=bool(self._batch))
         start.height, start.width = wanted.size
@@ -146,19 +147,23 @@ class Start:
         start.coefficients = self._keep_each(base.distortion.detach(), start.count)
         start.places = start.keep(present(plan.places, "the places of parameters among coefficients"))
         start.border = start.keep(border(size, native.dtype))
-        if plan.has_stages:
+        if plan.has_stages or plan.chart_is_inverted:
             start.domain = native.lenses.request
+            start.domain.is_chart = plan.chart_is_inverted
+        if plan.has_stages:
+            if native.dtype not in plan.fixed_ends:
+                start.domain.ends = None  # which C finds
             for name, radii in native.lenses.radii_wanted().items():
                 setattr(start.domain, name, start.keep(radii.contiguous()))
             self._limits = 0 if plan.is_radial else structs.AZIMUTHS + structs.EXTENT
 
     def warp(
         self, source: Camera, values: Mapping[str, Any], options: Options
-    ) -> tuple[LazyWarp, Sequence[float], Sequence[float]]:
+    ) -> tuple[LazyWarp, Sequence[float], Sequence[float]] | None:
         """Return the warp from the source to new cameras of values (B,) and (B, size), or numbers and lists for one.
 
         Also the factors (B,) on focal lengths for `min_filled`, and the part of each image that is filled then, (B,);
-        both are empty if nothing has to be filled.
+        both are empty if nothing has to be filled. None if a model has no formula for the coefficients that C took.
         """
         drawn, batch = self._packed(values)
         rows = batch[0] if batch else 1
@@ -182,6 +187,8 @@ class Start:
         room = np.ndarray((), layout, memory)  # in less time than tensors
         rotation = torch.from_numpy(room["rotation"]) if self._turns else None
         k = room["distortion"] if self._rest else self._distortion
+        if self._may_lack_formula and not self._has_formula(k):
+            return None
         if limits is not None and draws.followed == rows:
             draws.hold(limits)
         # some numbers may be no camera's
@@ -236,6 +243,11 @@ class Start:
             ends = measured_once(lens_ends, base, base.distortion.detach())
             self._struct.ends = self._keep_each(ends, *ends.shape[-2:])
 
+    def _has_formula(self, k: np.ndarray[Any, Any]) -> bool:
+        """Return whether the model has a formula for coefficients (B, n) or (n,)."""
+        sense = self._wanted.base.defined(torch.from_numpy(k).unbind(-1))
+        return sense is None or bool((sense > 0).all())
+
     def _native(self, draws: structs.Draws, room: np.ndarray[Any, Any]) -> Native | None:
         """Return the cameras that C made, as native code takes them.
 
@@ -260,11 +272,13 @@ class Start:
         return lenses_of(plan, k, new)
 
 
-def _can_make_lenses(base: Camera, native: Native) -> bool:
-    """Whether C can make lenses like that of the base of other coefficients."""
+def _can_make_lenses(native: Native) -> bool:
+    """Return whether C can make lenses like these of other coefficients."""
     plan = native.plan
-    if plan.places is None or plan.chart_is_inverted or plan.is_long or not base.always_defined:
+    if plan.places is None or plan.is_long:
         return False
-    if plan.has_stages:
-        plan.ends(native.lenses)
-    return not plan.has_stages or native.dtype in plan.fixed_ends
+    if not plan.has_stages:
+        return True
+    plan.ends(native.lenses)
+    knows_end = native.dtype in plan.fixed_ends or plan.parts[0].kind == structs.UNIFIED
+    return knows_end and not plan.chart_is_inverted

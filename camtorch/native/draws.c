@@ -89,13 +89,15 @@ static int64_t outline(const Draws *d, int64_t c, const double *f, const void *i
 static void ask(const Start *s, Cameras *lens, int limits) {
     Domain asked = s->domain;
     double parameters[lens->parameter_count];
-    if (!lens->safe_radius_sq) return; /* it has no stages */
+    if (!lens->safe_radius_sq && !lens->chart_table) return; /* its chart knows by its parameters where it ends */
     for (int64_t j = 0; j < lens->parameter_count; j++) parameters[j] = number(lens->parameters, j, lens->is_double);
     asked.cameras = 1, asked.parameters = parameters;
     asked.image_circle_sq = (void *)lens->image_circle_sq, asked.stagewise = (uint8_t *)lens->stagewise;
-    if (limits) asked.limits2 = (void *)lens->limits2, asked.extent = (void *)lens->extent;
+    if (lens->chart_table) asked.safe_radius_sq = (void *)lens->chart_safe_radius_sq, asked.table = (void *)lens->chart_table;
+    else if (limits) asked.limits2 = (void *)lens->limits2, asked.extent = (void *)lens->extent;
     else asked.safe_radius_sq = (void *)lens->safe_radius_sq, asked.image_radius_sq = (void *)lens->image_radius_sq, asked.table = (void *)lens->table;
     THIS(domain)(&asked);
+    if (lens->chart_table) put((void *)lens->chart_most2, 0, number(lens->chart_table, 1, lens->is_double), lens->is_double);
 }
 
 /* Finds the limits of azimuths of a new lens, for which a point waits */
@@ -254,6 +256,9 @@ static void divide(Draws *d) {
     TAKE_KNOWN(image_circle_sq, 1);
     TAKE_KNOWN(stagewise, 1);
     TAKE_KNOWN(table, 2 + 2 * NODES);
+    TAKE_KNOWN(chart_safe_radius_sq, 1);
+    TAKE_KNOWN(chart_most2, 1);
+    TAKE_KNOWN(chart_table, 2 + 2 * NODES);
     d->made.limits2 = d->made.extent = NULL;
     if (!(at = d->limits)) return;
     TAKE(d->made.limits2, AZIMUTHS);

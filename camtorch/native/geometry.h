@@ -102,7 +102,8 @@ typedef struct {
     const double *constants; /* (c, constant_count) */
     int64_t constant_count;
     int64_t is_chart, is_radial;     /* whether the factor is an inverted chart's; whether the lens is a factor alone */
-    const double *ends, *usual_ends; /* (c): the radius at which the chart ends, and beyond which there are no images */
+    const double *ends, *usual_ends; /* (c): the radius at which the chart ends, and beyond which there are no images;
+                                        NULL: those of a unified chart, by its parameters */
     const double *folds;             /* (c): of factors whose fold is not the root of a polynomial, or NULL */
     double most;                     /* the largest image that is a number to calculate with */
     const double *radii;             /* (MOST_RADII): from the centre to the end of the chart */

@@ -5,6 +5,7 @@
 enum { STEPS = 129 };         /* radii on which the image of a radial stage is looked at */
 #define LEAST_SLOPE 0.75
 #define WIDER 1.25
+#define TAN_87 19.081136687728211 /* of 87 degrees */
 
 /* The lens of a camera */
 typedef struct {
@@ -339,6 +340,18 @@ static double image_circle_sq_of(const Lens *lens, double edge) {
     return certain - change > LEAST_SLOPE ? furthest * furthest : INFINITY;
 }
 
+/* The radius at which a unified chart ends, and beyond which there are no images: `Unified.end`, `usual_end` */
+static void ends_of_unified(const Part *chart, const double *k, int is_double, double *end, double *usual_end) {
+    const double xi = chart->flags & HAS_XI ? *k++ : 0, alpha = chart->flags & HAS_ALPHA ? *k++ : chart->constant;
+    const double fold = (2 * alpha - 1) * (chart->flags & HAS_BETA ? *k : 1), beyond = (xi - 1) * (xi + 1);
+    const double inside = 1 - 64 * (is_double ? DBL_EPSILON : FLT_EPSILON);
+    const double usual = TAN_87 / (chart->flags & HAS_XI || chart->constant == 0 ? 1 : chart->constant);
+    *end = (is_double ? 1e9 : 19112.41165783858) / 2;
+    if (fold > 0) *end = fmin(*end, inside / sqrt(fold));
+    if (beyond > 0) *end = fmin(*end, inside / (alpha * xi + (1 - alpha) * sqrt(beyond)));
+    *usual_end = fmin(*end, usual);
+}
+
 /* The squared radius up to which a lens that folds there is certainly regular, in the precision of the points */
 static double within(double fold, double end, int is_double) {
     if (is_double) {
@@ -361,7 +374,10 @@ void THIS(domain)(const Domain *d) {
     const int is_double = (int)d->is_double;
     const Part *first = d->parts + 1; /* after the chart; of an inverted chart its factor takes its place */
     for (int64_t c = 0; c < d->cameras; c++) {
-        const double *numbers = d->parameters + c * d->parameter_count, end = d->ends[c], usual_end = d->usual_ends[c];
+        const double *numbers = d->parameters + c * d->parameter_count;
+        double end, usual_end;
+        if (d->ends) end = d->ends[c], usual_end = d->usual_ends[c];
+        else ends_of_unified(d->parts, numbers, is_double, &end, &usual_end);
         Lens lens = {d, first, numbers + numbers_of(d->parts), d->constants + c * d->constant_count};
         Part factor;
         if (d->is_chart) {

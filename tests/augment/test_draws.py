@@ -7,6 +7,7 @@ from cameras import DISTINCT, KEYS, needs_library, slow_unless, spread
 import camtorch as ct
 from camtorch.augment.drawer import CameraDrawer
 from camtorch.augment.filling import scaled, zoom_to_fill
+from camtorch.augment.native_draws import Start
 from camtorch.evaluate.kept import Kept
 from camtorch.projection import native_cameras
 
@@ -33,6 +34,8 @@ CASES = [
     for k, dtype in enumerate((torch.float32, torch.float64))
 ]
 EACH_LENS = {"bent", "filled"}
+# Models with inverted charts and stages, with parameters that are no coefficients, or with an end that is one
+WITHOUT_NATIVE_LENSES = {"brown_conrady", "f_theta_backward_sheared", "ocamcalib", "tabulated", "thin_prism_fisheye"}
 
 
 @pytest.mark.parametrize(
@@ -62,6 +65,28 @@ def test_as_the_formula(key, name, dtype, count, recwarn, monkeypatch):
     monkeypatch.setattr(native_cameras, "_lenses", Kept(1))  # without what the draw found of the lenses
     for one, other in zip(known, found.clone().unproject(pixels), strict=True):
         assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_native_code_makes_most_lenses(key, monkeypatch):
+    made, of = [], Start.of
+    monkeypatch.setattr(Start, "of", lambda wanted: made.append(of(wanted)))
+    source = spread(key, torch.float32).requires_grad_(False).resize(120, 160)
+    augmentation = A.RandomLens(distortion=0.1)
+    augmentation.change(source, augmentation.draw(1))
+    assert (made == [None]) is (key in WITHOUT_NATIVE_LENSES)
+
+
+@pytest.mark.parametrize(("key", "focal", "given"), [("fov", 300.0, [3.0]), ("eucm", 60.0, [0.5, 0.05])])
+def test_coefficients_without_a_formula_are_not_drawn(key, focal, given):
+    source = ct.MODELS[key]([focal, focal, 79.5, 59.5], given, image_size=(120, 160)).requires_grad_(False)
+    augmentation = A.RandomLens(distortion=1.0, focal=None, centre=None)
+    draw = augmentation.draw(40, torch.Generator().manual_seed(0))
+    for one in range(40):
+        of_one = {name: value[one : one + 1] for name, value in draw.items()}
+        expected, _ = augmentation.new_camera(source, {"distortion": of_one["distortion"]})
+        found = augmentation.change(source, of_one).target
+        torch.testing.assert_close(found.distortion, expected.distortion, rtol=1e-5, atol=1e-6)
 
 
 def test_a_range_that_native_code_does_not_know_is_drawn(monkeypatch):
