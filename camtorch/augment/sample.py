@@ -258,9 +258,9 @@ class SampleTransform(KeepsCamera, nn.Module):
         if not predicted:
             check_values(sample, named, self.options["mode"], owner)
         check_cameras(camera, count, named, owner)
-        tensors = {
-            name: t for name, (_, value) in named.items() for t in (value if isinstance(value, list) else [value])
-        }
+        tensors: dict[str, Tensor] = {}
+        for name, (_, value) in named.items():
+            tensors |= {f"{name}[{i}]": t for i, t in enumerate(value)} if isinstance(value, list) else {name: value}
         check_devices(owner, **tensors)
         camera = one_or_batch(camera)
         device = next((t.device for t in tensors.values()), torch.device("cpu"))

@@ -55,7 +55,6 @@ class ShiftedWarp(Warp):
         self.batch_shape: torch.Size = torch.Size((count,))
         self.register_buffer("shift", shift.to(rays), persistent=False)
         self.register_buffer("distance", distance, persistent=False)
-        self._surfaces = Kept()
 
     def between(self, source: Camera, target: Camera, rotation: Tensor | None, **options: Any) -> Warp:
         return ShiftedWarp(source, target, rotation, **{**self.own_parts(), **options})
@@ -107,7 +106,10 @@ class ShiftedWarp(Warp):
 
     def _surface(self) -> tuple[Tensor, Tensor]:
         """Return the source's pixel (B, H', W', 2) that shows what each target pixel sees, and whether there is one."""
-        return self._surfaces(self.tensors, self.form, self._found_surface)
+        surfaces: Kept = self.__dict__.setdefault("_surfaces", Kept())  # which pickles of 0.5 lack
+        if self.is_pinned and surfaces.result is not None:
+            return surfaces.result  # type: ignore[no-any-return]
+        return surfaces(self.tensors, self.form, self._found_surface)
 
     @torch.no_grad()
     def _found_surface(self) -> tuple[Tensor, Tensor]:
