@@ -16,8 +16,8 @@ from camtorch.augment.random_camera import RandomMount
 from camtorch.augment.ranges import Draw, Range, draw_numbers
 from camtorch.augment.shutter import RandomShutter
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.tensors import are_concrete
-from camtorch.values.arguments import as_mapping, present
+from camtorch.evaluate.tensors import are_concrete, known_false
+from camtorch.values.arguments import as_mapping, present, warn
 
 T = TypeVar("T")
 
@@ -78,6 +78,12 @@ class Compose(Augmentation):
         super().__init__(**options)
         self.augmentations = nn.ModuleList(parts)
         self._check_parts()
+        unused = [type(part).__name__ for part in parts if _is_other(part.camera, self.camera)]
+        if unused:
+            warn(
+                f"{name}: samples that bring no camera are of one camera, {type(self.camera).__name__}; that of "
+                f"{', '.join(unused)} is another one, and is not used. Pass one camera, to {name} itself"
+            )
         if len({repr(part.mirroring.key) for part in parts if part.mirroring is not None}) > 1:
             raise ValueError(f"{name}: flips must have equal landmarks, lateral_axis and swap_sides; got others")
 
@@ -185,6 +191,15 @@ class Compose(Augmentation):
     def extra_repr(self) -> str:
         options = {"p": self.p, "same_on_batch": self.same_on_batch, **self.options}
         return ", ".join(f"{name}={value!r}" for name, value in options.items())
+
+
+def _is_other(given: Any, camera: Any) -> bool:
+    """Whether a camera was given that is not `camera`: of another model, size or other numbers."""
+    if not (isinstance(given, Camera) and isinstance(camera, Camera)):
+        return False
+    if given.form != camera.form or [t.shape for t in given.tensors] != [t.shape for t in camera.tensors]:
+        return True
+    return any(known_false(a == b.to(a)) for a, b in zip(given.tensors, camera.tensors, strict=True))
 
 
 def _leaves(part: Augmentation) -> list[Augmentation]:

@@ -16,7 +16,7 @@ from camtorch.augment.jitter import jittered
 from camtorch.augment.native_draws import DRAWN_SIZES, Start, Wanted, too_wide
 from camtorch.augment.part import Part
 from camtorch.augment.presets import REAL, as_like
-from camtorch.augment.ranges import TURN, Draw, Range, RangeLike, as_range, as_tensors, values_for
+from camtorch.augment.ranges import POSITIVE, TURN, Draw, Range, RangeLike, as_range, as_tensors, values_for
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import hold_numbers, known_false, with_derivatives_of
@@ -219,6 +219,7 @@ class CameraDrawer(Augmentation):
     def _new_start(self, source: Camera, values: Mapping[str, Any]) -> Start | None:
         if not self._keeps_formulas:
             return None
+        self._check_ranges()
         names = values.keys() - self.beside_the_camera - {"lens"}
         source = source.detach().clone()
         base, sized, covered_radius = self._lens_for(source, values.get("lens"))
@@ -230,14 +231,20 @@ class CameraDrawer(Augmentation):
     def _new_camera(self, source: Camera, values: Mapping[str, Any]) -> tuple[Camera, Tensor | None]:
         if not self._keeps_formulas:
             return super()._new_camera(source, values)
-        for name, limit in _LIMITS.items():
-            size, one = limit.get("size"), self.ranges.get(name)  # which may have been set since
-            if one is not None and one.size != size:
-                wanted = "Range(low, high)" if size is None else f"Range(low, high, {size})"
-                raise ValueError(f"{self._name}: the range {name!r} must be {wanted}; got {one!r}")
+        self._check_ranges()
         example = precise(source.intrinsics.detach())
         kind: dict[str, Any] = {"dtype": example.dtype, "device": example.device}  # as_tensor makes float32 of floats
         return self.new_camera(source, {name: torch.as_tensor(value, **kind) for name, value in values.items()})
+
+    def _check_ranges(self) -> None:
+        """Raise a ValueError if a range, which may have been set since, draws what makes no camera."""
+        for name, limit in _LIMITS.items():
+            size, one = limit.get("size"), self.ranges.get(name)
+            if one is not None and one.size != size:
+                wanted = "Range(low, high)" if size is None else f"Range(low, high, {size})"
+                raise ValueError(f"{self._name}: the range {name!r} must be {wanted}; got {one!r}")
+            if one is not None and name in POSITIVE and one.low <= 0:
+                raise ValueError(f"{self._name}: the range {name!r} must be above 0; got {one!r}")
 
     def new_camera(self, source: Camera, values: Mapping[str, Tensor]) -> tuple[Camera, Tensor | None]:
         """Return the new camera and its turn, by formulas of torch; see `Augmentation.new_camera`."""

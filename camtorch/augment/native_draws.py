@@ -209,7 +209,7 @@ class Start:
                 for name in self._several:
                     getattr(one, name)[:] = values[name]
             except (TypeError, ValueError):
-                raise self._wrong_count(values, 1) from None
+                raise self._wrong_size(values, ()) from None
             return one, self._batch
         batch = self._batch or values[self._names[0]].shape[:1]
         many = _array(structs.Drawn, batch[0])()
@@ -218,16 +218,22 @@ class Start:
         for name in self._names:
             value = values[name]
             if value.shape != table[name].shape:
-                raise self._wrong_count(values, batch[0])
+                raise self._wrong_size(values, batch)
             table[name] = value
         return many, batch
 
-    def _wrong_count(self, values: Mapping[str, Any], rows: int) -> ValueError:
-        """Return the error of values for so many cameras that are not as many as C reads."""
-        several = [f"{name} as Range(low, high, {size})" for name, size in DRAWN_SIZES.items() if size > 1]
-        count, got = sum(DRAWN_SIZES[name] for name in self._names), sum(np.size(values[name]) for name in self._names)
-        wanted = f"{count} numbers for a sample, {', '.join(several)}, and others as Range(low, high)"
-        return ValueError(f"{self._wanted.owner}: ranges must draw {wanted}; got {got} for {rows} samples")
+    def _wrong_size(self, values: Mapping[str, Any], batch: tuple[int, ...]) -> ValueError:
+        """Return the error of values of cameras (B,) or () that are not as many as C reads."""
+        for name in self._names:
+            size = DRAWN_SIZES[name]
+            shape = (*batch, size) if size > 1 else batch
+            if np.shape(values[name]) != shape:
+                break
+        wanted = "Range(low, high)" if size == 1 else f"Range(low, high, {size})"
+        return ValueError(
+            f"{self._wanted.owner}: the range {name!r} must be {wanted}, which draws {shape}; got values "
+            f"{np.shape(values[name])}"
+        )
 
     def _complete(self, left: int, values: Mapping[str, Any]) -> None:
         """Compute what C lacked of the source or the base, by the flags `left`; it serves all later draws."""

@@ -21,7 +21,7 @@ from camtorch.augment.face import FaceNormalizer
 from camtorch.augment.fields import IMAGES, KEEP, KINDS, PLACE
 from camtorch.augment.front_end import FrontEnd, check_front_end
 from camtorch.augment.names import ALIASES, kind_of, refuse_unknown
-from camtorch.augment.sample import Sample, Single
+from camtorch.augment.sample import Sample, Single, refuse_options
 from camtorch.cameras.camera import Camera
 from camtorch.evaluate.kept import Kept
 from camtorch.warp.arrays import as_array, as_planes, as_tensor, can_share, plain
@@ -81,6 +81,7 @@ class Transform(FrontEnd):
         **fields: Any,
     ) -> Sample:
         """Augment a sample: keyword arguments, a dict, or both; see `Augmentation.forward` for the other arguments."""
+        refuse_options(fields, type(self.augmentation).__name__)
         tensors, write = self._read(sample, fields, self.camera)
         options = _set(draw=draw, generator=generator)
         if options and isinstance(self.augmentation, FaceNormalizer):

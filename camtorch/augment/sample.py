@@ -25,11 +25,11 @@ from camtorch.evaluate.door import pytree
 from camtorch.evaluate.kept import Kept
 from camtorch.evaluate.tensors import are_free, in_worker, is_unknown
 from camtorch.native.library import warn_if_missing
-from camtorch.values.arguments import as_flag, as_mapping, as_number, check_devices, no_camera
+from camtorch.values.arguments import as_flag, as_mapping, as_number, check_devices, no_camera, shown
 from camtorch.values.keywords import check_arguments
 from camtorch.values.module import GeometryModule
 from camtorch.values.threads import on_one_thread
-from camtorch.warp.options import as_options
+from camtorch.warp.options import Options, as_options
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -125,6 +125,30 @@ class SampleOptions(TypedDict, total=False):
     tolerance: float
 
 
+_SET_ON_TRANSFORMS = SampleOptions.__annotations__.keys() - {"camera"} | {"p", "same_on_batch", "min_filled"}
+"""Names of options, which are set when a transform is made, or on it, and are no fields of a sample."""
+
+
+def refuse_options(fields: Mapping[str, object], owner: str) -> None:
+    """Raise a TypeError if an option of a transform is among the keyword arguments of a call, which are fields."""
+    if not _SET_ON_TRANSFORMS.isdisjoint(fields):
+        name = next(name for name in fields if name in _SET_ON_TRANSFORMS)
+        how = f"Pass it to {owner}(...), or set augment.{name} = ...; a field of that name goes in a dict"
+        raise TypeError(f"{owner}: {name} is an option and no field; got {name}={shown(fields[name])}. {how}")
+
+
+def _option(name: str) -> Any:
+    """Return the property of one of the `options`."""
+
+    def get(transform: SampleTransform) -> Any:
+        return transform.options[name]
+
+    def put(transform: SampleTransform, value: Any) -> None:
+        transform.options = transform._as_options(**{**transform.options, name: value})
+
+    return property(get, put, doc="The option of that name.")
+
+
 class SampleTransform(KeepsCamera, nn.Module):
     """The base of what moves all fields of a sample by one change of cameras, as `Augmentation` does."""
 
@@ -165,9 +189,9 @@ class SampleTransform(KeepsCamera, nn.Module):
         self.camera = camera
         self.fields: dict[str, str] = dict(as_mapping(fields, "fields", self._name, "{'lidar': 'points'}"))
         check_kinds(self.fields, self._own_fields, self._name)
-        # Options of `Warp`, or of a `HalvingWarp`, which takes None as antialias too
-        self.options: Any = as_options(self._name, mode, padding_mode, fill, antialias, tolerance)
-        self.antialias = antialias
+        self.options: Any = self._as_options(
+            mode=mode, padding_mode=padding_mode, fill=fill, antialias=antialias, tolerance=tolerance
+        )
         self.mask_fill = mask_fill
         self.valid_mask = valid_mask
 
@@ -190,24 +214,27 @@ class SampleTransform(KeepsCamera, nn.Module):
             options["antialias"] = None
         super().__setstate__({**state, "options": options})  # type: ignore[no-untyped-call]
         self._calls = Calls()  # which states before 0.5 lack
-        self.antialias = options["antialias"]
+        self.options = self._as_options(**options)
 
-    @property
-    def antialias(self) -> bool | None:
-        """The option of that name."""
-        chosen: bool | None = self.options["antialias"]
-        return chosen
+    mode: str = _option("mode")
+    padding_mode: str = _option("padding_mode")
+    fill: tuple[float, ...] = _option("fill")
+    antialias: bool | None = _option("antialias")
+    tolerance: float = _option("tolerance")
 
-    @antialias.setter
-    def antialias(self, value: bool | None) -> None:
-        chosen = None if value is None else as_flag(value, "antialias", self._name)
-        self.options["antialias"] = False if chosen is None and not self._chooses_antialias else chosen
+    def _as_options(self, **options: Any) -> Options:
+        """Return checked options of the warps; antialias is None only for those that choose by themselves."""
+        checked = as_options(self._name, **options)
+        if checked["antialias"] is None and not self._chooses_antialias:
+            checked["antialias"] = False
+        return checked
 
     def _given(self, sample: Mapping[str, object] | None, fields: Mapping[str, object]) -> Sample:
         """Return the sample and the keyword arguments as one new dict, which is a `Single` if the sample is."""
         if not (sample is None or hasattr(sample, "keys")):
             must = f"a sample must be a dict of fields, or keywords, as in image=...; got {type(sample).__name__}"
             raise TypeError(f"{self._name}: {must}. {FRONT_ENDS}")
+        refuse_options(fields, self._name)
         kind = type(sample) if isinstance(sample, Single) else dict
         return kind({} if sample is None else sample, **fields)
 

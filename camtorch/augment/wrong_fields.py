@@ -104,6 +104,12 @@ def check_pose(value: Tensor, name: str, owner: str) -> None:
     """Raise a ValueError if poses do not begin with a rotation."""
     if not value.is_cpu or value.requires_grad:
         return
+    if value.shape[-2] == 4 and known_some(value[..., 3, :3].abs() > 0):  # a pose of NaN is missing
+        rows = value[..., 3, :].reshape(-1, 4)
+        raise ValueError(
+            f"{owner}: {name} must have the place in the last column, above a row 0, 0, 0, 1; got the last row "
+            f"{rows[(rows[:, :3].abs() > 0).any(-1)][0].tolist()}. A matrix for row vectors goes in as {name}.mT"
+        )
     rotations = value[..., :3, :3]
     if value.ndim == 2 and is_right(rotations):
         return

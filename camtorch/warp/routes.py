@@ -44,13 +44,14 @@ from camtorch.warp import compiled
 from camtorch.warp.camera_pair import CameraPair
 from camtorch.warp.grid import local_scale, locate
 from camtorch.warp.lattice import PixelPositions, Positions
-from camtorch.warp.options import Mode, Options, PaddingMode, Sampler, serving_all
+from camtorch.warp.options import Mode, Options, PaddingMode, Sampler, as_options, serving_all
 from camtorch.warp.panorama import Seam, seam_of
 from camtorch.warp.sampling import Pyramid, by_torch, laid_as, prepared, render
 
 Route = Literal["operator", "strips", "graph", "kept"]
 _MOST_KEPT_PIXELS = 1 << 25  # of a grid; longer ones, of 256 MB in float32, are made by strips and not kept
 _STRIP_PIXELS = 1 << 21  # of such a strip
+_CHECKED = frozenset({"mode", "padding_mode", "fill", "antialias"})  # attributes that may be set later
 _MOST_CALLS = 8  # forms of images for which a call is kept
 _FLOAT32_TOLERANCE = 1e-3  # pixels: some ulps of a position in an image a thousand pixels wide
 
@@ -145,6 +146,11 @@ class RoutedWarp(GeometryModule):
             _kept=Kept(),
         )
         seam_of(source)  # while its values may be looked at: traced code asks for it too
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _CHECKED:
+            value = as_options("Warp", **{name: value})[name]  # type: ignore[literal-required]
+        super().__setattr__(name, value)
 
     def __dir__(self) -> list[str]:
         """Return the names that users call, without those by which packages and other kinds of warps ask this one."""

@@ -268,12 +268,65 @@ def test_what_is_set_later_is_checked_as_by_the_constructor(camera):
         ("same_on_batch", 3, "RandomMount: same_on_batch must be"),
         ("mask_fill", "none", "RandomMount: mask_fill must be a number; got 'none'"),
         ("valid_mask", 3, "RandomMount: valid_mask must be True or False; got 3"),
+        ("mode", "nearst", r"RandomMount: mode must be one of \('nearest', .* got 'nearst'"),
+        ("padding_mode", None, "RandomMount: padding_mode must be one of"),
+        ("fill", "x", "RandomMount: fill must be a number"),
+        ("antialias", "x", "RandomMount: antialias must be True or False"),
+        ("tolerance", -1, "RandomMount: tolerance must be a number of pixels"),
     ):
         with pytest.raises((TypeError, ValueError), match=text):
             setattr(mount, name, value)
     assert (mount.p, mount.min_filled, mount.mask_fill, mount.valid_mask) == (0.5, None, 0, False)
     mount.p, mount.min_filled = 1, 0.5
     assert mount(keypoints=POINTS)["keypoints"].shape == POINTS.shape
+
+
+@pytest.mark.parametrize("kind", [RandomMount, HorizontalFlip, ct.augment.Compose])
+def test_options_of_images_may_be_set_later(camera, kind):
+    options = {"mode": "nearest", "padding_mode": "border", "fill": 0.5, "antialias": True, "tolerance": 0.0}
+    parts = [[RandomMount(yaw=(5, 5))]] if kind is ct.augment.Compose else []
+    later, image = kind(*parts, camera=camera, p=1.0), torch.rand(1, 3, *SIZE)
+    draw = later.draw(1)
+    later(image=image, draw=draw)  # what this call keeps is not used after a change
+    for name, value in options.items():
+        setattr(later, name, value)
+        made = kind(*parts, camera=camera, p=1.0, **{key: getattr(later, key) for key in options})
+        assert made.options == later.options
+        assert torch.equal(later(image=image, draw=draw)["image"], made(image=image, draw=draw)["image"])
+
+
+@pytest.mark.parametrize("options", [{"mode": "nearest"}, {"p": 0.0}, {"min_filled": 0.9}, {"fields": {"a": "keep"}}])
+def test_an_option_in_a_call_is_no_field(camera, options):
+    (name,) = options
+    mount, image = RandomMount(camera=camera), torch.rand(1, 3, *SIZE)
+    for call in (mount, lambda **given: ct.augment.numpy.Transform(mount)(**given | {"image": np.zeros((*SIZE, 3))})):
+        with pytest.raises(TypeError, match=rf"RandomMount: {name} is an option and no field; got {name}="):
+            call(image=image, **options)
+    assert mount({"image": image, **options})[name] == options[name]  # as a field of a dict, it stays
+
+
+def test_a_pose_for_row_vectors_is_refused(camera):
+    pose = torch.eye(4)
+    pose[3, :3] = torch.tensor([0.1, 0.2, 0.5])
+    for fields in ({"head_pose": pose}, {"head_pose": pose.expand(2, 4, 4), "image": torch.rand(2, 3, *SIZE)}):
+        with pytest.raises(ValueError, match=r"place in the last column, above a row 0, 0, 0, 1; .* head_pose\.mT"):
+            RandomMount(camera=camera)(fields)
+    assert RandomMount(camera=camera)(head_pose=pose.mT)["head_pose"].shape == (4, 4)
+
+
+def test_a_chain_tells_of_a_camera_that_it_does_not_use(camera):
+    ct.augment.Compose([RandomMount(camera=camera), RandomMount(camera=60)], camera=camera)
+    with pytest.warns(UserWarning, match="of one camera, .*; that of RandomMount is another one, and is not used"):
+        ct.augment.Compose([RandomMount(camera=ct.Pinhole.from_fov(50, image_size=SIZE))], camera=camera)
+
+
+@pytest.mark.parametrize("given", [ct.augment.Range(0, 0), ct.augment.Range(60, 80, 1)])
+def test_a_range_that_is_set_later_has_to_make_a_camera(camera, given):
+    lens = ct.augment.RandomLens("kannala_brandt", fov=(60, 80), camera=camera)
+    lens(keypoints=POINTS)
+    lens.ranges["fov"] = given
+    with pytest.raises(ValueError, match=r"RandomLens: the range 'fov' must be .*; got Range\("):
+        lens(keypoints=POINTS)
 
 
 NONE = dict.fromkeys(("camera", "rotation", "crop_place", "source_rotation", "keypoints"))

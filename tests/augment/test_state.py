@@ -375,7 +375,7 @@ def test_every_warning_of_samples_is_in_the_table():
     found = set()
     for path in Path(A.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.FunctionDef) and path.name != "ranges.py":
+            if isinstance(node, ast.FunctionDef) and path.name != "ranges.py" and node.name != "__init__":
                 calls = [ast.unparse(one) for one in ast.walk(node) if isinstance(one, ast.Call)]
                 told = [call for call in calls if call.startswith("warn(") and "FutureWarning" not in call]
                 found |= {node.name} if told else set()
