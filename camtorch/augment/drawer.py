@@ -236,6 +236,10 @@ class CameraDrawer(Augmentation):
         kind: dict[str, Any] = {"dtype": example.dtype, "device": example.device}  # as_tensor makes float32 of floats
         return self.new_camera(source, {name: torch.as_tensor(value, **kind) for name, value in values.items()})
 
+    def extra_repr(self) -> str:
+        fov = "" if self._among is None else f", fov=({self._among[0]:g}, {self._among[1]:g})"
+        return f"like={REAL!r}{fov}, {super().extra_repr()}" if self._is_real else super().extra_repr()
+
     def _check_ranges(self) -> None:
         """Raise a ValueError if a range, which may have been set since, draws what makes no camera."""
         for name, limit in _LIMITS.items():
