@@ -1,6 +1,6 @@
 """The protocol of a camera within camtorch; `Camera` is one, and no package below cameras/ imports it."""
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor
 
@@ -8,13 +8,6 @@ from camtorch.evaluate.kept import Kept
 from camtorch.optics.model_spec import ModelSpec
 from camtorch.values.arguments import Numbers
 from camtorch.values.module import BatchedModule
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import torch
-
-    from camtorch.projection.rows import Direction
 
 
 class CameraLike(ModelSpec, BatchedModule):
@@ -51,6 +44,4 @@ class CameraLike(ModelSpec, BatchedModule):
         def unproject(self, pixels: Numbers) -> tuple[Tensor, Tensor]: ...
         def rays(self, stride: int = 1) -> tuple[Tensor, Tensor]: ...
         def pixel_grid(self, stride: int = 1) -> Tensor: ...
-        def _evaluate(
-            self, direction: Direction, rows: Tensor, lead: torch.Size, tensors: Sequence[Tensor]
-        ) -> tuple[Tensor, Tensor]: ...
+        def _evaluate(self, direction: Any, rows: Tensor, lead: Any, tensors: Any) -> tuple[Tensor, Tensor]: ...

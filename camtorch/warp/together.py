@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -284,36 +284,45 @@ class SampleCall:
         results: dict[str, MovedField | None] = {}
         for name, read in self._readers.items():
             results[name] = read(values[name])
-        native = loaded()
         # images of a batch, by the threads that make the lattices
         if self._count > 1 and len(self._jobs):
-            run, counters = native.camtorch_lattices, self._lattices.counters
+            run, counters = loaded().camtorch_lattices, self._lattices.counters
             if run_and_follow(run, call.lattices, self._count, counters, target, source):
                 return {}
-        # all else, again if a limit of a camera was missing; images too if one thread makes them, else their lattice
-        call.job_count, call.is_whole = self._images_of_call, self._is_whole
-        while flags := native.camtorch_together(call):
-            if flags & structs.LEFT_MOST:
-                return {}
-            of_labels = flags >> structs.LEFT_BITS  # if C came to the labels, all images are made
-            if not of_labels:
-                follow(flags, target, source)
-                continue
-            call.job_count = 0
-            follow(of_labels, source, target)
-            if of_labels == structs.LEFT_LABELS:  # nothing else is missing
-                for name in self._may_be_refused:
-                    results[name] = None
-                break
+        refused = self._run(source, target)
+        if refused is None:
+            return {}
+        for name in refused:
+            results[name] = None
         if not self._is_whole:
             for job in self._jobs:  # threads share each image by its tiles
                 job.next = 0
-                spread(functools.partial(native.camtorch_sample, job), min(self._threads, self._tiles))
+                spread(functools.partial(loaded().camtorch_sample, job), min(self._threads, self._tiles))
         for name, narrower in self._narrowed.items():
             pair = results[name]
             if pair is not None:
                 results[name] = in_range(pair[0], narrower), pair[1]
         return results
+
+    def _run(self, source: Native, target: Native) -> Sequence[str] | None:
+        """Move the labels, and the image of one sample or its lattice alone; return the names of refused labels.
+
+        None if the call does not serve. It is repeated if a limit of a camera was missing.
+        """
+        call, run = self._call, loaded().camtorch_together
+        call.job_count, call.is_whole = self._images_of_call, self._is_whole
+        while flags := run(call):
+            if flags & structs.LEFT_MOST:
+                return None
+            of_labels = flags >> structs.LEFT_BITS
+            if of_labels == 0:
+                follow(flags, target, source)
+                continue
+            call.job_count = 0  # C came to the labels, so all images are made
+            follow(of_labels, source, target)
+            if of_labels == structs.LEFT_LABELS:  # nothing else is missing
+                return self._may_be_refused
+        return ()
 
 
 def pixels_together(
