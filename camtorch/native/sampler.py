@@ -126,7 +126,11 @@ def _copied(images: Tensor, layout: torch.memory_format) -> Tensor:
 
 
 def describe(job: structs.Job, images: Tensor, result: Tensor, mode: Mode, padding: str, fill: Sequence[float]) -> None:
-    """Write into a job what arguments of `NativeJob` have in common: all but images and positions."""
+    """Write into a job what arguments of `NativeJob` have in common: all but images and positions.
+
+    Raises:
+        ValueError: If torch alone has the mode.
+    """
     job.source_strides[:], job.result_strides[:] = images.stride(), result.stride()
     job.count, job.channels, job.height, job.width = result.shape
     job.source_height, job.source_width = images.shape[-2:]
@@ -134,7 +138,11 @@ def describe(job: structs.Job, images: Tensor, result: Tensor, mode: Mode, paddi
     job.hold(owners)
     job.fill, job.fill_elements = fills.data_ptr(), elements.data_ptr()
     job.type = _BYTES[images.dtype.itemsize] if mode == "nearest" else _TYPES[images.dtype]
-    job.mode, job.padding, job.tile_rows = MODES[mode].code, PADDING_CODES[padding], _tile_rows(result.shape[3])
+    code = MODES[mode].code
+    if code < 0:  # C would call what lies before its table of modes
+        known = ", ".join(name for name, row in MODES.items() if row.code >= 0)
+        raise ValueError(f"the native sampler: mode must be one of {known}; got {mode!r}")
+    job.mode, job.padding, job.tile_rows = code, PADDING_CODES[padding], _tile_rows(result.shape[3])
 
 
 def _tile_rows(width: int) -> int:

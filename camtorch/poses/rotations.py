@@ -124,7 +124,7 @@ def as_rotation(rotation: Numbers | None, owner: str) -> Tensor | None:
         return rotation if rotation.requires_grad else rotation.clone()
     rotation = as_real(rotation, "rotation", owner)
     if rotation.shape[-2:] != (3, 3) or rotation.ndim > 3:
-        hint = ". Pass ct.Extrinsics(vector, (0, 0, 0)).matrix()[..., :3, :3] for a rotation vector"
+        hint = ". Pass ct.Extrinsics(vector, (0, 0, 0)).matrix()[..., :3, :3].detach() for a rotation vector"
         hint = hint if rotation.shape[-1:] == (3,) or rotation.shape[-2:] == (3, 1) else ""
         hint = ". Pass T[..., :3, :3] of a pose T" if rotation.shape[-2:] == (4, 4) else hint
         raise ValueError(f"{owner}: rotation must be (3, 3) or (B, 3, 3); got shape {tuple(rotation.shape)}{hint}")

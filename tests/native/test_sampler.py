@@ -385,6 +385,14 @@ STRANGE = {
 }
 
 
+def test_a_mode_of_torch_alone_is_no_job(monkeypatch):
+    monkeypatch.setitem(sampler.MODES, "lanczos", sampler.ModeOfSampling(-1, 0, 3))
+    images = torch.zeros(1, 3, 8, 8)
+    assert not sampler.takes(images.dtype, "lanczos")
+    with pytest.raises(ValueError, match="mode must be one of nearest, bilinear, bicubic; got 'lanczos'"):
+        sampler.NativeJob(images, (8, 8), "lanczos", "zeros", (0.0,) * 3, grid=torch.zeros(1, 8, 8, 2))
+
+
 @pytest.mark.parametrize("kind", STRANGE)
 @pytest.mark.parametrize("mode", MODES)
 def test_strange_tensors_are_images(kind, mode):

@@ -1,6 +1,7 @@
 """Laws of Warp: images, labels and derivatives move together."""
 
 import math
+import re
 from functools import partial
 from itertools import combinations
 
@@ -243,3 +244,12 @@ def test_a_call_that_is_ready_follows_every_change(change):
     after = warp(images)
     assert torch.equal(after, later(images))
     assert after.shape != before.shape or not torch.equal(after, before)
+
+
+def test_the_rotation_that_the_error_about_a_vector_names_is_kept():
+    camera, vector = ct.Pinhole.from_fov(70, image_size=(12, 16)), [0.1, 0.0, 0.0]
+    with pytest.raises(ValueError, match="rotation must be") as error:
+        ct.Warp(camera, camera, vector)
+    code = re.search(r"Pass (ct\..*) for a rotation vector", str(error.value))[1]
+    rotation = eval(code, {"ct": ct, "vector": vector})
+    assert torch.equal(ct.Warp(camera, camera, rotation).state_dict()["rotation"], rotation)
