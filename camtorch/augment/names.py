@@ -19,8 +19,12 @@ ALIASES = {
 }
 _WORDS_OF_KINDS = {
     "roi": "boxes",
-    **dict.fromkeys(("eye", "pupil", "nose", "mouth", "corner", "center", "centre"), "keypoints"),
+    "poly": "polygons",
+    "lmk": "landmarks",
+    **dict.fromkeys(("kp", "kpt", "eye", "pupil", "nose", "mouth", "corner", "center", "centre"), "keypoints"),
+    **dict.fromkeys(("pt", "position", "cloud", "pointcloud"), "points"),
 }
+_SIMILAR, _SAME = 0.7, 0.8  # as difflib has it: img is similar to image, logits not to points; a plural is the same
 _ANGLES = {"yaw", "pitch", "roll"}
 
 
@@ -60,7 +64,7 @@ def refuse_unknown(sample: Mapping[str, Any], fields: Mapping[str, str], owner: 
     for name, value in sample.items():
         is_unknown = value is not None and kind_of(name, value, fields, owner) is None
         if is_unknown and _may_be_geometry(name, value, single):
-            raise ValueError(f"{owner}: {_about_unknown(name, value)}")
+            raise ValueError(f"{owner}: {_about_unknown(name, value, fields)}")
 
 
 def check_kinds(fields: Mapping[str, str], own: Iterable[str], owner: str) -> None:
@@ -93,8 +97,11 @@ def _beginning(name: str, value: object) -> str | None:
     return begins[-1] if begins else None
 
 
-def _about_unknown(name: str, value: object) -> str:
-    """Return the text of the error about geometry of unknown name, which says what it may be."""
+def _about_unknown(name: str, value: object, fields: Mapping[str, str]) -> str:
+    """Return the text of the error about geometry of unknown name, which says what it may be.
+
+    fields: name -> kind, of other names.
+    """
     if isinstance(value, Mapping):
         return (
             f"fields that move must be at the top of samples; got real numbers in the dict {name!r}. "
@@ -105,7 +112,8 @@ def _about_unknown(name: str, value: object) -> str:
     elif _is_angle(name):
         meant = "A head's angles go in as head_pose, by ct.head_rotation(), a gaze's as pitch_yaw. "
     else:
-        meant = "".join(f"Did you mean {kind!r}? " for kind in _close_to(name))
+        known = difflib.get_close_matches(name, (key for key in fields if "*" not in key), 1, _SAME)
+        meant = "".join(f"Did you mean {close!r}? " for close in known or _close_to(name))
     return (
         f"{name!r} must have a kind, by which its numbers move with the camera; got real numbers. {meant}"
         f"Pass fields={{{name!r}: KIND}}, with KIND one of {', '.join(KINDS)} or {KEEP}, to leave it unchanged"
@@ -130,13 +138,15 @@ def is_text(value: Any) -> bool:
 def _close_to(name: str) -> list[str]:
     """Return the kind that a name may mean: of the whole, or of its last word, as in `face_bbox` and `left_eye`."""
     last = name.rpartition("_")[2].removesuffix("s")
+    if same := difflib.get_close_matches(name, KINDS, 1, _SAME):
+        return same
     if name.startswith("seg"):
         return ["mask"]
     if "box" in last:
         return ["boxes"]
     if last in _WORDS_OF_KINDS:
         return [_WORDS_OF_KINDS[last]]
-    return difflib.get_close_matches(name, KINDS, 1) or difflib.get_close_matches(last, KINDS, 1)
+    return difflib.get_close_matches(name, KINDS, 1, _SIMILAR) or difflib.get_close_matches(last, KINDS, 1, _SIMILAR)
 
 
 def _may_be_geometry(name: str, value: Any, single: bool, above: int = 0) -> bool:

@@ -30,7 +30,7 @@ Taken = ParamSpec("Taken")
 Result = TypeVar("Result")
 Name = TypeVar("Name", bound=str)
 
-CLOSE = 0.5  # as difflib has it: size and image_size are
+CLOSE = 0.55  # as difflib has it: size and image_size are, prob and roll are not
 TOLD: set[object] = set()  # keys of what this process has told its user; see `first_time`
 
 

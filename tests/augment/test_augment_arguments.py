@@ -10,7 +10,17 @@ import torch
 
 import camtorch as ct
 import camtorch.augment.numpy
-from camtorch.augment import PRESETS, FaceNormalizer, HorizontalFlip, RandomCamera, RandomLens, RandomMount, outlines
+from camtorch.augment import (
+    PRESETS,
+    FaceNormalizer,
+    HorizontalFlip,
+    RandomCamera,
+    RandomLens,
+    RandomMount,
+    names,
+    outlines,
+)
+from camtorch.augment.fields import KINDS
 
 SIZE, POINTS = (30, 40), torch.zeros(2, 5, 2)
 
@@ -35,6 +45,7 @@ OPTIONS = [
     ({"image_size": (30, 0)}, "image_size must be positive"),
     ({"tolerance": -1}, "tolerance must be"),
     ({"rol": 20}, r"unknown keyword 'rol'; did you mean 'roll'\?"),
+    ({"prob": 0.4}, "unknown keyword 'prob'; known are yaw"),
     ({"focal": (0.9, 1.1)}, "unknown keyword .focal.; .*RandomCamera has it"),
 ]
 OF_LENSES = [
@@ -53,6 +64,27 @@ OF_LENSES = [
 def test_options(kind, options, text):
     with pytest.raises((ValueError, TypeError), match=f"{kind.__name__}: {text}"):
         kind(**options)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("segment", "Did you mean 'segments'"),
+        ("segmentation", "Did you mean 'mask'"),
+        ("kpts", "Did you mean 'keypoints'"),
+        ("logits", r"got real numbers\. Pass fields="),
+        ("probs", r"got real numbers\. Pass fields="),
+    ],
+)
+def test_an_unknown_field_is_close_to_one_that_is_known_or_to_none(camera, name, text):
+    mount = RandomMount(camera=camera, fields={"segments": "polygons"})
+    with pytest.raises(ValueError, match=text):
+        mount({name: torch.zeros(2, 5, 2)})
+
+
+def test_a_kind_of_almost_that_name_comes_before_the_beginning_of_a_name(monkeypatch):
+    monkeypatch.setitem(KINDS, "segments", KINDS["polygons"])
+    assert names._close_to.__wrapped__("segment") == ["segments"]
 
 
 @pytest.mark.parametrize(
