@@ -1,6 +1,7 @@
 """The command line `camtorch`: running commands and showing errors."""
 
 import argparse
+import difflib
 import gc
 import importlib
 import importlib.metadata
@@ -8,7 +9,7 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
 
 from camtorch import __version__
@@ -16,18 +17,43 @@ from camtorch.cli import commands, processes
 from camtorch.cli.terminal import lacks_memory, note, reason, say
 from camtorch.native import library
 
+_OTHER_NAMES = {"undistort": "dewarp", "view": "show", "plot": "show", "info": "show"}  # that other tools give commands
+_CLOSE = 0.65  # as difflib has it: unwarp and dewarp are, corners and border are not
+
 
 class _Parser(argparse.ArgumentParser):
+    commands: Iterable[str] = ()
+
     def __init__(self, **options: Any):
         super().__init__(allow_abbrev=False, **options)
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Return what arguments say; unknown ones raise an error here, where a command knows its options."""
+        known, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return known, unknown
+
     def error(self, message: str) -> NoReturn:
         name, hint = message.partition("unrecognized arguments: ")[2].split(" ")[0], f"see {self.prog} --help"
+        command = message.partition("argument COMMAND: invalid choice: ")[2].partition(" (choose")[0].strip("'\"")
         if os.path.splitext(name)[1] and not name.startswith("-") and not os.path.exists(name):
             message += f"; -o {name} names the new file"
         elif name.startswith("-") or message.startswith("argument COMMAND: invalid choice"):
+            message += self._question_about(command, name.partition("=")[0])
             hint += "; commands and options of 0.3 that are gone: docs/leaving-0.3.md"
         raise ValueError(f"{message} ({hint})")
+
+    def _question_about(self, command: str, option: str) -> str:
+        """Return whether a known command, or else option, is meant: one that begins so or is close; or nothing."""
+        if command:
+            known = {name: name for name in self.commands} | _OTHER_NAMES
+        else:
+            known = {name.lstrip("-"): name for name in self._option_string_actions if name.startswith("--")}
+        word = command or option.lstrip("-")
+        begin = [name for name in known if word and name.startswith(word)]
+        meant = begin or difflib.get_close_matches(word, known, 1, _CLOSE)
+        return f"; did you mean {known[meant[0]]}?" if meant else ""
 
 
 class _Version(argparse.Action):
@@ -89,5 +115,7 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of all options, which also generates the page of commands."""
     parser = _Parser(prog="camtorch", description="Cameras as layers for PyTorch.")
     parser.add_argument("--version", action=_Version, nargs=0, help="show what is installed and exit")
-    commands.add_all(parser.add_subparsers(title="commands", dest="command", required=True, metavar="COMMAND"))
+    subparsers = parser.add_subparsers(title="commands", dest="command", required=True, metavar="COMMAND")
+    commands.add_all(subparsers)
+    parser.commands = subparsers.choices
     return parser
