@@ -26,7 +26,7 @@ COLLECTION = "camtorch/lenses/gyroflow.npz"
 LIMITS = {"camtorch": 930_000, COLLECTION: 680_000}
 """Bytes of a wheel without a library: of all but the collection, and of the collection, which is 9 numbers of 9,810
 lenses to the bit. Six of the eight bytes of each are noise, 0.53 MB that nothing makes smaller."""
-LIMIT = 2_705_000  # bytes of a wheel with a library
+LIMIT = 2_725_000  # bytes of a wheel with a library
 
 
 class Target(NamedTuple):
