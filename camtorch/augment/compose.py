@@ -16,7 +16,7 @@ from camtorch.augment.random_camera import RandomMount
 from camtorch.augment.ranges import Draw, Range, draw_numbers
 from camtorch.augment.shutter import RandomShutter
 from camtorch.cameras.camera import Camera
-from camtorch.evaluate.tensors import are_concrete, known_false
+from camtorch.evaluate.tensors import known_false
 from camtorch.values.arguments import as_mapping, present, warn
 
 T = TypeVar("T")
@@ -163,7 +163,6 @@ class Compose(Augmentation):
         # a chain shows what the first camera sees, also where a later one, as of a crop, sees less
         for part in self.parts:
             part.tell_of_empty_images(camera)
-        self._calls.has_looked = are_concrete(camera.intrinsics)
 
     def _change(self, camera: Camera, draw: Draw) -> Change:
         parts = self.parts

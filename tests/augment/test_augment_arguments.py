@@ -327,6 +327,12 @@ def test_options_of_images_may_be_set_later(camera, kind):
         assert torch.equal(later(image=image, draw=draw)["image"], made(image=image, draw=draw)["image"])
 
 
+def test_all_tensors_of_a_list_are_on_one_device(camera):
+    rows = [torch.ones(2, 2), torch.ones(3, 2, device="meta"), torch.ones(2, 2)]
+    with pytest.raises(ValueError, match=r"on one device; got keypoints\[0\] on cpu, keypoints\[1\] on meta"):
+        RandomMount(camera=camera)(keypoints=rows)
+
+
 @pytest.mark.parametrize("options", [{"mode": "nearest"}, {"p": 0.0}, {"min_filled": 0.9}, {"fields": {"a": "keep"}}])
 def test_an_option_in_a_call_is_no_field(camera, options):
     (name,) = options

@@ -180,6 +180,32 @@ def test_depths_in_a_list_move_as_those_of_single_samples(plane):
         torch.testing.assert_close(out["distance"][i], alone["distance"][plane])
 
 
+def shifted_warp(camera, distance):
+    augment = ct.augment.RandomMount(shift=((0.02, 0.03),) * 3)
+    return augment.change(camera, {**augment.draw(1), "of_distance": distance}).parts[0].warp
+
+
+def test_a_pinned_warp_keeps_the_surface_that_its_images_show():
+    camera = lens()
+    distance = sample_of(camera)["distance"][None]
+    warp = shifted_warp(camera, distance).pin()
+    before = warp(distance), warp.moved_distance(distance)
+    warp.source.intrinsics.data.mul_(1.2)
+    assert torch.equal(warp(distance), before[0])
+    assert torch.equal(warp.moved_distance(distance) > 0, before[1] > 0)
+
+
+def test_a_state_of_0_5_looks_for_its_surface():
+    camera = lens()
+    distance = sample_of(camera)["distance"][None]
+    warp = shifted_warp(camera, distance)
+    state = {**warp.__getstate__(), "_found": None}  # which 0.5 kept, and nothing else of a surface
+    state.pop("_surfaces", None)
+    old = type(warp).__new__(type(warp))
+    old.__setstate__(state)
+    assert torch.equal(old.moved_distance(distance), warp.moved_distance(distance))
+
+
 def test_when_the_numbers_of_a_warp_change_it_looks_for_the_surface_again():
     camera = lens()
     sample = sample_of(camera)

@@ -391,6 +391,9 @@ def test_parts_of_a_chain_that_are_added_later_count():
     chain.augmentations.append(A.RandomMount())
     with pytest.raises(ValueError, match="must have a camera"):
         chain(fields)
+    chain.augmentations.append(A.RandomMount(yaw=(80, 80)))
+    with pytest.warns(UserWarning, match="of the new images"):
+        chain({**fields, "camera": camera()})
 
 
 def test_replays_of_kornia_follow_ranges():
